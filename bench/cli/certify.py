@@ -135,7 +135,9 @@ def _values(proof: Proof, track: Track) -> dict[str, object]:
 
 def _interval(found: Interval | None) -> dict[str, float | None] | None:
     """Of one scenario there are no bounds."""
-    return found and {name: None if math.isnan(value) else value for name, value in asdict(found).items()}
+    if found is None:
+        return None
+    return {name: None if math.isnan(value) else value for name, value in asdict(found).items()}
 
 
 def _table(proofs: Sequence[Proof]) -> Table:

@@ -42,7 +42,8 @@ class Kinematics:
         lane_width, length, width: of a lane and of a car, in m.
         target_speeds: speeds of FASTER and SLOWER in m/s, increasing and uniform.
         top_speed: no car drives faster, in m/s.
-        start_speed: the ego's speed at the start, in m/s; it starts in the middle of a lane.
+        start_speed: the ego's speed at the start, in m/s; it starts in the middle of a lane. None if it starts at any speed and
+            anywhere on a lane, so that only its first measurement says where.
         speed_gain, heading_gain, lateral_gain: gains of the controllers, in 1/s.
         max_heading: largest heading of a lane change, in rad.
         max_steering: largest steering angle of the controllers, in rad.
@@ -57,7 +58,7 @@ class Kinematics:
     width: float
     target_speeds: tuple[float, ...]
     top_speed: float
-    start_speed: float
+    start_speed: float | None
     speed_gain: float
     heading_gain: float
     lateral_gain: float

@@ -185,7 +185,7 @@ def grid_of(chosen: Chosen[Any], name: str | None) -> Grid:
     if own is not None:
         if name not in (None, own.name):
             raise UserError(
-                f"grid {name!r} is none of the world {world!r}, whose cells are given by world.axes: leave out grid"
+                f"grid {name!r} is none of the world {world!r}, whose cells follow from its parameters: leave out grid"
             )
         return own
     name = name or chosen.component.grid

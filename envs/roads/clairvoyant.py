@@ -9,7 +9,8 @@ from cavbench.compiled import entry_point
 from cavbench.envs.highway.clairvoyant import FAILURE, HORIZON_S, ClairvoyantPlanner
 from cavbench.envs.roads.config import TaskKind
 from cavbench.envs.roads.engine import PARTS, RoadsEngine, drive
-from cavbench.envs.roads.state import Integers
+from cavbench.envs.roads.recordings import Recordings
+from cavbench.envs.roads.state import Floats, Integers
 
 FAR_S = {TaskKind.EXIT: 10.0}
 """Seconds of a plan where it takes longer to get into the right lane than `HORIZON_S`."""
@@ -22,15 +23,25 @@ def roll_batch(
     episodes: NDArray[np.void],
     generators: NDArray[np.uint64],
     actions: Integers,
+    controls: Floats,
     parameters: NDArray[np.void],
     failed: Integers,
+    crashed: NDArray[np.bool_],
     progress: NDArray[np.float32],
+    recordings: Recordings,
 ) -> None:
-    """Simulate plans [R, P, T] from the states of R episodes: decisions before a failure, and the progress made [R, P]."""
+    """Simulate plans [R, P, T] from the states of R episodes: decisions before a failure, whether it is a crash, progress [R, P].
+
+    Args:
+        roads, bodies, episodes, generators, parameters, recordings: as of the engine, of the R episodes.
+        actions: [R, P, T] numbers of discrete actions.
+        controls: [R, P, T, 3] those of a continuous ego, as `RoadsEngine.controls`; [R, P, 0, 3] for none.
+        failed, crashed, progress: outputs.
+    """
     given = parameters[0]
     copy, episode = np.empty_like(bodies[0]), np.empty_like(episodes[:1])
     generator, corners = np.empty_like(generators[0]), np.empty((2, 5, 2))
-    control, parts = np.zeros(3), np.zeros(PARTS)
+    nothing, parts = np.zeros(3), np.zeros(PARTS)
     for row in range(actions.shape[0]):
         road = roads[episodes[row].network]
         for plan in range(actions.shape[1]):
@@ -39,7 +50,9 @@ def roll_batch(
             episode[:] = episodes[row : row + 1]
             now, total, step = episode[0], 0.0, 0
             while step < actions.shape[2]:
-                drive(road, copy, now, given.actions[actions[row, plan, step]], control, given, corners, parts)
+                action = given.actions[actions[row, plan, step]]
+                control = controls[row, plan, step] if controls.shape[2] else nothing
+                drive(road, copy, now, action, control, given, corners, parts, recordings)
                 if now.crashed or now.offroad:
                     break
                 total += now.progress
@@ -47,6 +60,7 @@ def roll_batch(
                 if now.arrived:
                     step = actions.shape[2]
             failed[row, plan] = step
+            crashed[row, plan] = now.crashed
             progress[row, plan] = total
 
 
@@ -68,14 +82,18 @@ class RoadsPlanner(ClairvoyantPlanner):
         """See `ClairvoyantPlanner.worth`."""
         engine = self.roads
         failed, progress = np.zeros(tried.shape[:2], np.int64), np.zeros(tried.shape[:2], np.float32)
+        crashed, controls = np.zeros(failed.shape, np.bool_), np.zeros((*failed.shape, 0, 3))
         roll_batch(
             engine.roads,
             np.ascontiguousarray(engine.bodies[rows]),
             np.ascontiguousarray(engine.episodes[rows]),
             np.ascontiguousarray(engine.generators[rows]),
             tried,
+            controls,
             self.parameters,
             failed,
+            crashed,
             progress,
+            engine.recordings,
         )
         return progress - np.where(failed < self.length, FAILURE - failed, 0.0)

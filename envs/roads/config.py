@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavbench.driving.features import ActionType, Driver
 from cavbench.envs.highway.config import check_target_speeds
+from cavbench.envs.roads.recordings import NOTHING, Reaction, Recordings
 from cavbench.envs.roads.state import MOST_COLUMNS, MOST_SPEEDS, PARAMETERS, Feature, Kind, Measure, ViewKind
 
 
@@ -26,6 +27,7 @@ class TaskKind(IntEnum):
     TWO_WAY = 5
     U_TURN = 6
     RACETRACK = 7
+    RECORDED = 8
 
 
 DEFAULT_SPEEDS = (20.0, 25.0, 30.0)
@@ -50,6 +52,8 @@ class Scene:
         goal: number of the ego's destination among those of the road, where it has one.
         sensor_range: in m.
         noise_sigma: of the sensor, in m and m/s.
+        recordings: recorded traffic; equal recordings must be the same object.
+        reaction: what recorded cars do.
     """
 
     road: NDArray[np.void]
@@ -62,6 +66,8 @@ class Scene:
     goal: int = 0
     sensor_range: float = 200.0
     noise_sigma: float = 0.0
+    recordings: Recordings = NOTHING
+    reaction: Reaction = Reaction.REPLAY
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

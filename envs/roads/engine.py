@@ -16,6 +16,7 @@ from cavbench.envs.roads import exit_rules as leave
 from cavbench.envs.roads import intersection_rules as intersection
 from cavbench.envs.roads import merge_rules as merge
 from cavbench.envs.roads import racetrack_rules as racetrack
+from cavbench.envs.roads import replay
 from cavbench.envs.roads import roundabout_rules as roundabout
 from cavbench.envs.roads import two_way_rules as two_way
 from cavbench.envs.roads import u_turn_rules as u_turn
@@ -27,6 +28,7 @@ from cavbench.envs.roads.lanes import is_on
 from cavbench.envs.roads.motion import apply_meta_action
 from cavbench.envs.roads.network import WIDTH
 from cavbench.envs.roads.progress import progress, way_left
+from cavbench.envs.roads.recordings import Recordings, joined
 from cavbench.envs.roads.rows import observe
 from cavbench.envs.roads.simulation import advance
 from cavbench.envs.roads.state import (
@@ -55,6 +57,7 @@ OF_SCENE = (
     "goal",
     "sensor_range",
     "noise_sigma",
+    "reaction",
 )
 """Fields of a scene that its episode has, too."""
 PARTS = 5
@@ -62,14 +65,21 @@ PARTS = 5
 MERGE_CLASSIC, MERGE_GENERIC = int(TaskKind.MERGE_CLASSIC), int(TaskKind.MERGE_GENERIC)
 ROUNDABOUT, INTERSECTION, EXIT = int(TaskKind.ROUNDABOUT), int(TaskKind.INTERSECTION), int(TaskKind.EXIT)
 TWO_WAY, U_TURN, RACETRACK = int(TaskKind.TWO_WAY), int(TaskKind.U_TURN), int(TaskKind.RACETRACK)
+RECORDED = int(TaskKind.RECORDED)
 OCCUPANCY, TIMES = int(ViewKind.OCCUPANCY), int(ViewKind.TIMES)
 DISCRETE, CONTINUOUS = int(Kind.DISCRETE), int(Kind.CONTINUOUS)
-WAY = int(Measure.WAY)
+WAY, PACE = int(Measure.WAY), int(Measure.PACE)
 
 
 @inner
 def spawn(
-    road: Road, bodies: Bodies, episode: Episode, generator: Generator, parameters: Parameters, corners: Floats
+    road: Road,
+    bodies: Bodies,
+    episode: Episode,
+    generator: Generator,
+    parameters: Parameters,
+    corners: Floats,
+    recordings: Recordings,
 ) -> None:
     """The start of an episode, from its random numbers."""
     if parameters.task == MERGE_CLASSIC:
@@ -86,12 +96,14 @@ def spawn(
         two_way.spawn(road, bodies, episode, generator, parameters)
     elif parameters.task == U_TURN:
         u_turn.spawn(road, bodies, episode, generator, parameters)
+    elif parameters.task == RECORDED:
+        replay.spawn(road, bodies, episode, parameters, recordings)
     else:
         racetrack.spawn(road, bodies, episode, generator, parameters)
     ego = bodies[episode.ego]
     settle_ego(ego, parameters)
     episode.driven, episode.arrived = 0.0, False
-    episode.ahead = way_left(road, ego) if parameters.progress == WAY else 0.0
+    episode.ahead = way_left(road, ego) if parameters.progress == WAY else ego.x
     episode.range_y = WIDTH * road.edges[road.lanes[ego.lane].edge].lanes
 
 
@@ -120,6 +132,8 @@ def reward(
         return u_turn.reward(road, bodies, episode, on_road, parameters, parts)
     if parameters.task == RACETRACK:
         return racetrack.reward(road, ego, control[2], on_road, parts)
+    if parameters.task == RECORDED:
+        return replay.reward(ego, episode, on_road, parts)
     return merge.reward(road, bodies, episode, action, parameters, parts)
 
 
@@ -161,6 +175,8 @@ def score(
         if parameters.progress == WAY and way_left(road, ego) <= 0.0:
             episode.arrived = True
             episode.progress += parameters.full_steps - episode.steps
+        elif parameters.progress == PACE and episode.arrived:
+            episode.progress += parameters.full_steps - episode.steps
     episode.terminated = ego.crashed or episode.arrived or (parameters.offroad_terminal and episode.offroad)
     episode.truncated = episode.steps >= parameters.max_steps or episode.time >= parameters.duration
 
@@ -199,13 +215,18 @@ def drive(
     parameters: Parameters,
     corners: Floats,
     parts: Floats,
+    recordings: Recordings,
 ) -> None:
     """One action of one episode: up to `action_repeat` decisions, fewer if the episode ends."""
     episode.reward = episode.progress = 0.0
     for held in range(parameters.action_repeat):
         apply_action(road, bodies[episode.ego], action, control, held == 0, parameters)
         episode.time += parameters.period
-        advance(road, bodies[: episode.bodies], episode, parameters.substeps, parameters, corners)
+        there = bodies[: episode.bodies]
+        if parameters.task == RECORDED:
+            replay.advance(road, there, episode, parameters.substeps, parameters, corners, recordings)
+        else:
+            advance(road, there, episode, parameters.substeps, parameters, corners)
         episode.steps += 1
         score(road, bodies, episode, action, control, parameters, parts)
         if episode.terminated or episode.truncated:
@@ -243,6 +264,7 @@ def step_batch(
     numbers: NDArray[np.float32],
     flags: NDArray[np.bool_],
     parts: Floats,
+    recordings: Recordings,
 ) -> None:
     """One action of every unfinished episode. See `RoadsEngine.step`."""
     corners, given = np.empty((2, 5, 2)), parameters[0]
@@ -255,7 +277,8 @@ def step_batch(
             numbers[PROGRESS, number] = 0.0
             continue
         road = roads[episode.network]
-        drive(road, cars, episode, given.actions[actions[number]], controls[number], given, corners, parts[number])
+        action = given.actions[actions[number]]
+        drive(road, cars, episode, action, controls[number], given, corners, parts[number], recordings)
         look(road, cars, episode, given, rows, work, grid, observation[number])
         report(road, cars, episode, given, numbers, flags, number)
         if given.task == INTERSECTION:
@@ -274,6 +297,7 @@ def start_batch(
     observation: NDArray[np.float32],
     numbers: NDArray[np.float32],
     flags: NDArray[np.bool_],
+    recordings: Recordings,
 ) -> None:
     """Start the episodes `chosen` [R] from `seeds` [R]. See `RoadsEngine.reset`."""
     rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
@@ -287,9 +311,29 @@ def start_batch(
         episode.reward = episode.progress = 0.0
         episode.crashed = episode.offroad = episode.terminated = episode.truncated = False
         seed_generator(generators[number], seeds[row])
-        spawn(road, cars, episode, generators[number], given, corners)
+        spawn(road, cars, episode, generators[number], given, corners, recordings)
         look(road, cars, episode, given, rows, work, grid, observation[number])
         report(road, cars, episode, given, numbers, flags, number)
+
+
+@entry_point
+def look_batch(
+    roads: NDArray[np.void],
+    bodies: NDArray[np.void],
+    episodes: NDArray[np.void],
+    parameters: NDArray[np.void],
+    observation: NDArray[np.float32],
+    numbers: NDArray[np.float32],
+    flags: NDArray[np.bool_],
+) -> None:
+    """Write the observation and the record of every episode. See `RoadsEngine.look`."""
+    rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
+    given = parameters[0]
+    grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
+    for number in range(episodes.size):
+        episode, cars = episodes[number], bodies[number]
+        look(roads[episode.network], cars, episode, given, rows, work, grid, observation[number])
+        report(roads[episode.network], cars, episode, given, numbers, flags, number)
 
 
 class RoadsEngine:
@@ -318,6 +362,11 @@ class RoadsEngine:
         self.numbers = np.zeros((len(Number), batch), dtype=np.float32)
         self.flags = np.zeros((len(Flag), batch), dtype=np.bool_)
         self.parts = np.zeros((batch, PARTS))
+        recorded = {id(scene.recordings): scene.recordings for scene in config.scenes}
+        self.recordings, bounds = joined(list(recorded.values()))
+        parts = [list(recorded).index(id(scene.recordings)) for scene in config.scenes]
+        for column, name in enumerate(("first_track", "track_count", "first_start", "start_count")):
+            self.episodes[name] = bounds[parts, column]
         self.episodes["network"] = [places[id(scene.road)] for scene in config.scenes]
         for name in OF_SCENE:
             self.episodes[name] = [getattr(scene, name) for scene in config.scenes]
@@ -345,9 +394,14 @@ class RoadsEngine:
             self.observation,
             self.numbers,
             self.flags,
+            self.recordings,
         )
 
-    def _controls(self, action: NDArray[np.floating]) -> Floats:
+    def look(self) -> None:
+        """Write the current observation and record of every episode, without a step."""
+        look_batch(self.roads, self.bodies, self.episodes, self.parameters, self.observation, self.numbers, self.flags)
+
+    def controls(self, action: NDArray[np.floating]) -> Floats:
         """[B, 3] acceleration in m/s2, steering in rad, and the size of the action; one column [B, 1] is steering alone."""
         both = action if action.shape[1] == 2 else np.concatenate([np.zeros_like(action), action], 1)
         return np.concatenate(
@@ -372,7 +426,7 @@ class RoadsEngine:
             if actions.min() < 0 or actions.max() > last:
                 raise ValueError(f"actions must be between 0 and {last}, got {actions.tolist()}")
         elif self.config.ego == Kind.CONTINUOUS:
-            controls = self._controls(np.asarray(action))
+            controls = self.controls(np.asarray(action))
         step_batch(
             self.roads,
             self.bodies,
@@ -386,4 +440,5 @@ class RoadsEngine:
             self.numbers,
             self.flags,
             self.parts,
+            self.recordings,
         )

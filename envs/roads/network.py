@@ -20,6 +20,8 @@ Point = Sequence[float] | NDArray[np.float64]
 
 WIDTH = 4.0
 """AbstractLane.DEFAULT_WIDTH in m."""
+MARGIN = 1.0
+"""Road.neighbour_vehicles: up to so many m beside a lane, cars are neighbours on it."""
 
 
 class LaneKind(IntEnum):
@@ -45,12 +47,14 @@ class Lane:
 
     A straight lane runs from `start` along `direction` (a unit vector) at `heading`. A sine lane swings around it by `amplitude`
     sin(`pulsation` s + `phase`). A circular one turns around `center` from `start_phase`, to the right if `turn` is 1, to the
-    left if it is -1 (y points to the right). Lengths in m, angles in rad, `speed_limit` in m/s.
+    left if it is -1 (y points to the right). Cars up to `margin` beside it are neighbours on it. Lengths in m, angles in rad,
+    `speed_limit` in m/s.
     """
 
     kind: LaneKind
     length: float
     width: float = WIDTH
+    margin: float = MARGIN
     start: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     direction: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     heading: float = 0.0
@@ -112,6 +116,7 @@ class LaneRecord:
     priority: int
     length: float
     width: float
+    margin: float  # m beside it, up to which bodies are neighbours on it
     speed_limit: float  # m/s
     start_x: float
     start_y: float
@@ -250,7 +255,7 @@ class Network:
 
 
 def _fill(place: np.void, lane: Lane) -> None:
-    for name in ("kind", "forbidden", "priority", "length", "width", "speed_limit", "heading", "amplitude"):
+    for name in ("kind", "forbidden", "priority", "length", "width", "margin", "speed_limit", "heading", "amplitude"):
         place[name] = getattr(lane, name)
     for name in ("pulsation", "phase", "radius", "start_phase", "turn"):
         place[name] = getattr(lane, name)

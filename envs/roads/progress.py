@@ -13,7 +13,7 @@ from cavbench.envs.roads.lanes import heading_at
 from cavbench.envs.roads.state import Bodies, Body, Episode, Kind, Measure, Parameters, Road
 
 CONTINUOUS = int(Kind.CONTINUOUS)
-HIGHWAY, WAY = int(Measure.HIGHWAY), int(Measure.WAY)
+HIGHWAY, WAY, PACE = int(Measure.HIGHWAY), int(Measure.WAY), int(Measure.PACE)
 
 
 @inner
@@ -45,6 +45,7 @@ def progress(road: Road, bodies: Bodies, episode: Episode, parameters: Parameter
     """The progress of a decision in [0, 1]; see `Measure`.
 
     On a way, metres count once, and at most so many in a decision as the reference speed covers: what is more, counts later.
+    Where traffic is recorded, the reference is the mean speed of the recorded driver.
     """
     ego = bodies[episode.ego]
     if parameters.progress == HIGHWAY:
@@ -53,6 +54,11 @@ def progress(road: Road, bodies: Bodies, episode: Episode, parameters: Parameter
         covered = parameters.reference_speed * parameters.period
         share = clip((episode.ahead - way_left(road, ego)) / covered, 0.0, 1.0)
         episode.ahead -= share * covered
+        return share
+    if parameters.progress == PACE:
+        covered = episode.pace * parameters.period
+        share = clip((ego.x - episode.ahead) / covered, 0.0, 1.0)
+        episode.ahead += share * covered
         return share
     turned = ego.heading - heading_at(road.lanes[ego.lane], ego.along)
     return clip(ego.speed * math.cos(turned) / parameters.reference_speed, 0.0, 1.0)

@@ -19,12 +19,13 @@ Integers = NDArray[np.int64]
 
 
 class Kind(IntEnum):
-    """What a body on the road is: highway-env's MDPVehicle, Vehicle, IDMVehicle or Obstacle."""
+    """What a body on the road is: highway-env's MDPVehicle, Vehicle, IDMVehicle or Obstacle, or a car that is replayed."""
 
     DISCRETE = 0
     CONTINUOUS = 1
     IDM = 2
     OBSTACLE = 3
+    RECORDED = 4
 
 
 class Feature(IntEnum):
@@ -52,11 +53,13 @@ class ViewKind(IntEnum):
 
 
 class Measure(IntEnum):
-    """What a world calls progress: that of the highway, metres of the way to a goal, or speed along the lane."""
+    """What a world calls progress: that of the highway, metres of the way to a goal, speed along the lane, or metres along the
+    road as far as a recorded driver came."""
 
     HIGHWAY = 0
     WAY = 1
     LANE = 2
+    PACE = 3
 
 
 class Body:
@@ -107,6 +110,14 @@ class Episode:
     opposing: float  # the same on the opposite lane
     arrivals: float  # chance that a car comes after a decision
     goal: int  # number of the ego's destination
+    first_track: int  # number of its scene's first track among those of the batch
+    track_count: int  # how many its scene has
+    first_start: int  # number of its scene's first start
+    start_count: int  # how many its scene has
+    reaction: int  # of recorded cars, `Reaction`
+    begin: int  # frame of the recording at which the episode began
+    taken: int  # number of the track whose place the ego has taken
+    pace: float  # m/s, the mean speed of the recorded driver
     seed: int  # scenario seed
     steps: int  # decisions so far
     frames: int  # physics frames so far, on a regulated road

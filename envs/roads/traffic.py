@@ -8,7 +8,7 @@ import numpy as np
 
 from cavbench.compiled import inner
 from cavbench.envs.highway.dynamics import MAX_STEERING, clip, not_zero
-from cavbench.envs.highway.search import NEIGHBOUR_MARGIN, NO_ONE
+from cavbench.envs.highway.search import NO_ONE
 from cavbench.envs.highway.traffic import (
     LANE_CHANGE_DELAY,
     MAX_ACCELERATION,
@@ -29,14 +29,14 @@ def is_aside(lane: LaneRecord, x: float, y: float) -> bool:
     """Whether a point is surely not on a lane as wide as neighbours are looked for; without trigonometry."""
     if lane.kind == CIRCULAR:
         off_x, off_y = x - lane.center_x, y - lane.center_y
-        return abs(lane.radius - math.sqrt(off_x * off_x + off_y * off_y)) > lane.width / 2 + NEIGHBOUR_MARGIN + 1e-6
+        return abs(lane.radius - math.sqrt(off_x * off_x + off_y * off_y)) > lane.width / 2 + lane.margin + 1e-6
     across = (y - lane.start_y) * lane.direction_x - (x - lane.start_x) * lane.direction_y
-    return abs(across) - abs(lane.amplitude) > lane.width / 2 + NEIGHBOUR_MARGIN + 1e-6
+    return abs(across) - abs(lane.amplitude) > lane.width / 2 + lane.margin + 1e-6
 
 
 @inner
 def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
-    """Whether a body is on a lane (with a margin of 1 m), and where, in m."""
+    """Whether a body is on a lane or within its margin, and where, in m."""
     lane = road.lanes[number]
     if number == body.lane:
         along, across = body.along, body.across
@@ -44,7 +44,7 @@ def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
         return False, 0.0
     else:
         along, across = local_coordinates(lane, body.x, body.y)
-    return is_on(lane, along, across, NEIGHBOUR_MARGIN), along
+    return is_on(lane, along, across, lane.margin), along
 
 
 @inner
@@ -63,7 +63,7 @@ def place_near(road: Road, body: Body, number: int) -> tuple[bool, float]:
 def neighbours_on_straight(lane: LaneRecord, bodies: Bodies, number: int) -> tuple[int, int]:
     """`neighbours` on a straight lane without linked ones: the same numbers without branches, which here cannot be predicted."""
     start_x, start_y, direction_x, direction_y = lane.start_x, lane.start_y, lane.direction_x, lane.direction_y
-    reach, end = lane.width / 2 + NEIGHBOUR_MARGIN, lane.length + CAR_LENGTH
+    reach, end = lane.width / 2 + lane.margin, lane.length + CAR_LENGTH
     own = (bodies[number].x - start_x) * direction_x + (bodies[number].y - start_y) * direction_y
     front = rear = NO_ONE
     nearest, last = np.inf, -np.inf

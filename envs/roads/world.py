@@ -70,7 +70,11 @@ class RoadsWorld(DrivingWorld):
             raise ValueError(
                 f"policy_frequency must divide simulation_frequency ({self.simulation_frequency}), got {self.policy_frequency}"
             )
-        self._configured((self.scene(self.home),), Control())
+        self._configured((self.sketch(),), Control())
+
+    def sketch(self) -> Scene:
+        """The scene that parameters are checked with."""
+        return self.scene(self.home)
 
     @abstractmethod
     def scene(self, cell: Cell) -> Scene:

@@ -52,6 +52,11 @@ def stacked(ego: Ego) -> Tensor:
     return torch.stack([one.detach().float().cpu() for one in ego], -1)
 
 
+def _middle(low: Tensor, high: Tensor) -> Tensor:
+    """The middle of intervals; of one that is open at an end, the other end."""
+    return torch.where(low.isfinite(), low, high) / 2 + torch.where(high.isfinite(), high, low) / 2
+
+
 class DeadReckoning:
     """Predicts the ego's motion from its actions, and corrects it where it contradicts the measurement.
 
@@ -79,14 +84,13 @@ class DeadReckoning:
         """The ego's motion at this observation: the prediction, moved into the measured row's box."""
         width, gained = self.kinematics.lane_width, state["known"]
         low, high = boxes.low[..., 0, :], boxes.high[..., 0, :]
-        middle = torch.where(low[..., 1].isfinite(), low[..., 1], high[..., 1]) / 2
-        middle = middle + torch.where(high[..., 1].isfinite(), high[..., 1], low[..., 1]) / 2
+        middle = _middle(low[..., 1], high[..., 1])
         first = (middle / width).round().clamp(min=0)
-        start = torch.full_like(first, self.kinematics.start_speed)
+        begins, start, aimed = self._first(middle, first, _middle(low[..., 2], high[..., 2]))
         ego = Ego(*(state[name] for name in Ego._fields))
         missing = gained & (ego.y > high[..., 1] + OFF_THE_ROAD) & (ego.target_lane * width > high[..., 1])
         edge = torch.where(gained, torch.where(missing, ego.target_lane - 1, ego.edge), UNKNOWN_EDGE)
-        y = torch.where(gained, torch.clamp(ego.y, low[..., 1] - SLACK, high[..., 1] + SLACK), first * width)
+        y = torch.where(gained, torch.clamp(ego.y, low[..., 1] - SLACK, high[..., 1] + SLACK), begins)
         cos = ego.heading.cos()
         speed = torch.clamp(ego.speed * cos, low[..., 2] - SLACK, high[..., 2] + SLACK) / cos.clamp(min=0.1)
         return Ego(
@@ -94,9 +98,18 @@ class DeadReckoning:
             heading=torch.where(missing, 0.0, ego.heading),
             speed=torch.where(gained, speed, start),
             target_lane=torch.where(gained, torch.minimum(ego.target_lane, edge), first),
-            target_speed=torch.where(gained, ego.target_speed, start),
+            target_speed=torch.where(gained, ego.target_speed, aimed),
             edge=edge,
         )
+
+    def _first(self, middle: Tensor, lane: Tensor, speed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Place across the road, speed and target speed [...] at the start, from what is measured then."""
+        car = self.kinematics
+        if car.start_speed is not None:
+            start = torch.full_like(lane, car.start_speed)
+            return lane * car.lane_width, start, start
+        table = torch.tensor(car.target_speeds, dtype=speed.dtype, device=speed.device)
+        return middle, speed, table[(speed[..., None] - table).abs().argmin(-1)]
 
     def after(self, ego: Ego, action: Tensor) -> TensorDict:
         """The state after an action, int64 [B] or float [B, 2]; without a gradient."""

@@ -285,7 +285,7 @@ def test_the_command_line_drives_checks_and_replays_it(bench: Bench, tmp_path: P
             "defense 'shield' does not fit world 'gym': it needs to know how .* cars move",
         ),
         (["attack=noise", "defense=tracker+shield"], "does not fit world 'gym'"),
-        (["attack=noise", "grid=standard-v2"], "whose cells are given by world.axes: leave out grid"),
+        (["attack=noise", "grid=standard-v2"], "whose cells follow from its parameters: leave out grid"),
         (["attack=noise", "world.id=CartPole-v1,Pendulum-v1"], "a run uses one world"),
     ],
 )
