@@ -6,8 +6,8 @@ from tests.checks.rules import broken, built_in, each
 
 WORLDS = built_in("world")
 NEEDS = {"gym": {"id": "merge-v0"}}
-"""Parameters that a world needs. `photos` needs photographs, `recorded` a scene: their own tests make some. `sumo` has a test of its
-own that is skipped where SUMO is not installed."""
+"""Parameters that a world needs. `photos` needs photographs, `recorded` a scene: their own tests make some. `sumo` has a test of
+its own that is skipped where SUMO is not installed."""
 
 
 @each(sorted(WORLDS.keys() - {"photos", "recorded", "sumo"}))
