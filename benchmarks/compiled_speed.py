@@ -1,6 +1,7 @@
-"""Measures what compiled networks save against torch:
+"""Measures what compiled networks and filters save against torch:
 
     python benchmarks/compiled_speed.py [--attacks pgd zo rehearse] [--defense advtrain] [--episodes 20] [--rounds 3]
+    python benchmarks/compiled_speed.py --part filter --defense tracker+shield --attacks pgd rehearse
 
 Prints the CPU time of a pass of the victim, forward and with its gradient, and of whole units, each as torch's over that of the
 compiled code. Both are measured alternately in one process and one thread, on scenarios that tune attacks; the median of the
@@ -24,6 +25,7 @@ from cavbench.core.track import Job
 from cavbench.driving import Policy, State
 from cavbench.driving.drive import drive
 from cavbench.driving.fused.network import Fused
+from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.policy import repeated
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
@@ -31,6 +33,7 @@ from cavbench.errors import in_one_line
 from cavbench.run.process import settle
 from cavbench.scenarios import SeedBlock
 
+PARTS = {"network": Fused, "filter": Mask}
 SIZES = (20, 40, 160, 720, 1600)
 
 
@@ -41,22 +44,24 @@ def main() -> None:
     parser.add_argument("--defense", default="advtrain")
     parser.add_argument("--episodes", type=int, default=20, help="episodes of a unit")
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--part", choices=PARTS, default="network", help="what torch computes in turn")
     arguments = parser.parse_args()
     settle()
+    part = PARTS[arguments.part]
     print("| what | torch, ms | compiled, ms | torch / compiled |\n|---|---|---|---|")
     policy = _pair("none", arguments.defense, arguments.victim).load(0)
     for size in SIZES:
         for gradient in (False, True):
             work = _queries(policy, size, gradient)
             name = f"{size} points{', with their gradient' if gradient else ''}"
-            _line(name, work, arguments.rounds, max(1, 4000 // size))
+            _line(name, work, part, arguments.rounds, max(1, 4000 // size))
     for attack in arguments.attacks:
         pair = _pair(attack, arguments.defense, arguments.victim)
         job = _job(pair, arguments.episodes)
-        _line(f"a unit of {attack}", lambda job=job: drive(job, ()), arguments.rounds, 1)  # type: ignore[misc]
+        _line(f"a unit of {attack}", lambda job=job: drive(job, ()), part, arguments.rounds, 1)  # type: ignore[misc]
 
 
-def _line(name: str, work: Callable[[], object], rounds: int, repeats: int) -> None:
+def _line(name: str, work: Callable[[], object], part: type, rounds: int, repeats: int) -> None:
     """Print the CPU times of torch and of the compiled code, measured in turn, and the median of their ratios."""
 
     def seconds() -> float:
@@ -68,7 +73,7 @@ def _line(name: str, work: Callable[[], object], rounds: int, repeats: int) -> N
     work()
     pairs = []
     for _ in range(rounds):
-        with patch.object(Fused, "fits", lambda self, observation: False):
+        with patch.object(part, "fits", lambda self, *given: False):
             torch_s = seconds()
         pairs.append((torch_s, seconds()))
     before, after = (1000 * statistics.median(side) for side in zip(*pairs, strict=True))

@@ -16,7 +16,8 @@ from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.corridor import Corridor, CorridorJudge
 from cavbench.driving.intervals.ego import Ego
 from cavbench.driving.intervals.margins import Judge, Margins
-from cavbench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
+from cavbench.driving.intervals.mask import Mask
+from cavbench.driving.intervals.policy import IntervalPolicy, corrected, remembers, with_inner
 from cavbench.driving.intervals.rooms import Caution, cars_of
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
@@ -64,7 +65,7 @@ class Shield(DrivingDefense):
 
 
 class Filter(IntervalPolicy):
-    """A policy behind a filter. Its state is the reckoned ego, the highest lane that was seen, and the inner policy's state."""
+    """A policy behind a filter. Its state is the reckoned ego, and the inner policy's state."""
 
     def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
         super().__init__(
@@ -75,15 +76,20 @@ class Filter(IntervalPolicy):
         self.caution = Caution(braking=settings.braking, seconds=settings.braking_s, distance=settings.distance)
 
     def initial(self, episodes: Tensor) -> State:
-        own = {"ego": self.reckoning.unknown(episodes), "edge": torch.zeros(len(episodes), device=episodes.device)}
+        own = {"ego": self.reckoning.unknown(episodes)}
         return with_inner(own, self.policy.initial(episodes), episodes.shape)
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
-        ego = self.ego(boxes, state)
-        inner = self.policy.advance(corrected(observation, ego, self.assumed), action, state.get("inner", None))
-        own = {"ego": self.reckoning.after(ego, action), "edge": self.edge(ego, boxes, state)}
-        return with_inner(own, inner, state.batch_size)
+        ego, after = self.reckoning.step(boxes, state["ego"], action)
+        inner = state.get("inner", None)
+        if remembers(self.policy):
+            inner = self.policy.advance(corrected(observation, ego, self.assumed), action, inner)
+        return with_inner({"ego": after, **self.kept(ego, boxes, state)}, inner, state.batch_size)
+
+    def kept(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> dict[str, Tensor]:
+        """What the next state has besides."""
+        return {}
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None
@@ -93,11 +99,6 @@ class Filter(IntervalPolicy):
     def ego(self, boxes: Boxes, state: TensorDictBase) -> Ego:
         return self.reckoning.now(boxes, state["ego"])
 
-    def edge(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Tensor:
-        """The highest lane [...] that is known to exist: the ego was in it, or a car surely was."""
-        lane = cars_of(ego, boxes).rightmost(self.reckoning.kinematics.lane_width)
-        return torch.maximum(torch.maximum(lane, ego.target_lane), state["edge"])
-
 
 class Shielded(Filter):
     """The filter for discrete actions: a mask."""
@@ -105,9 +106,13 @@ class Shielded(Filter):
     def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
         super().__init__(settings, policy, facts)
         self.judge = Judge(self.reckoning, self.period, self.caution)
+        self.mask = Mask(self.judge, self.assumed, self.band, SOFTNESS)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
+        if self.mask.fits(observation, state):
+            found = self.mask(observation, boxes, state["ego"])
+            return self.mask.lowered(self.policy.scores(found.seen, state.get("inner", None)), found)
         ego = self.ego(boxes, state)
         values = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
         allowed = self.allowed(self.margins(ego, boxes))
@@ -117,13 +122,19 @@ class Shielded(Filter):
 
     def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
         assert state is not None
+        if self.mask.fits(observation, state):
+            found = self.mask(observation, boxes, state["ego"])
+            return Passed(found.seen, found.hard[..., self.reckoning.order] > 0)
         ego = self.ego(boxes, state)
         return Passed(corrected(observation, ego, self.assumed), self.allowed(self.margins(ego, boxes)) > 0.5)
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        ego = self.ego(boxes, state)
-        return self.margins(ego, boxes).safe
+        # What was shown counts only for what is passed on.
+        shown = boxes.low.new_zeros(*boxes.present.shape, 1 + boxes.low.shape[-1])
+        if self.mask.fits(shown, state):
+            return self.mask(shown, boxes, state["ego"]).safe
+        return self.margins(self.ego(boxes, state), boxes).safe
 
     def margins(self, ego: Ego, boxes: Boxes) -> Margins:
         return self.judge(ego, cars_of(ego, boxes))
@@ -143,11 +154,23 @@ class Shielded(Filter):
 
 
 class ShieldedControls(Filter):
-    """The filter for continuous actions: a projection onto what is left of acceleration and steering."""
+    """The filter for continuous actions: a projection onto what is left of acceleration and steering.
+
+    Its state has the highest lane that was seen besides.
+    """
 
     def __init__(self, settings: Shield, policy: Policy, facts: DrivingFacts) -> None:
         super().__init__(settings, policy, facts)
         self.judge = CorridorJudge(self.reckoning, self.period, self.caution, self.band)
+
+    def initial(self, episodes: Tensor) -> State:
+        state = super().initial(episodes)
+        assert state is not None
+        state["edge"] = torch.zeros(len(episodes), device=episodes.device)
+        return state
+
+    def kept(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> dict[str, Tensor]:
+        return {"edge": self.edge(ego, boxes, state)}
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
@@ -169,3 +192,8 @@ class ShieldedControls(Filter):
 
     def corridor(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Corridor:
         return self.judge(ego, cars_of(ego, boxes), self.edge(ego, boxes, state))
+
+    def edge(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Tensor:
+        """The highest lane [...] that is known to exist: the ego was in it, or a car surely was."""
+        lane = cars_of(ego, boxes).rightmost(self.reckoning.kinematics.lane_width)
+        return torch.maximum(torch.maximum(lane, ego.target_lane), state["edge"])

@@ -13,8 +13,8 @@ from torch import Tensor
 from cavbench.core.ranges import NotNegative
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
 from cavbench.driving.intervals.boxes import Assumed, Boxes
-from cavbench.driving.intervals.policy import IntervalPolicy, corrected, reckoning, with_inner
-from cavbench.driving.intervals.tracks import narrowed, predicted
+from cavbench.driving.intervals.policy import IntervalPolicy, corrected, reckoning, remembers, with_inner
+from cavbench.driving.intervals.tracks import predicted
 from cavbench.driving.threat import Norm
 
 
@@ -73,10 +73,9 @@ class Tracked(PolicyWrapper):
         boxes, inner = self.boxes(observation, state), state.get("inner", None)
         if isinstance(self.policy, IntervalPolicy):
             inner = self.policy.moved(observation, boxes, action, inner)
-        else:
+        elif remembers(self.policy):
             inner = self.policy.advance(self._estimate(observation, boxes, state), action, inner)
-        ego = self.reckoning.now(boxes, state["ego"])
-        after = self.reckoning.after(ego, action)
+        ego, after = self.reckoning.step(boxes, state["ego"], action)
         tracks = TensorDict(
             predicted(boxes, ego, after, self.reckoning.kinematics, self.period), batch_size=state.batch_size
         )
@@ -98,8 +97,7 @@ class Tracked(PolicyWrapper):
     def boxes(self, observation: Tensor, state: State) -> Boxes:
         """What is known about every row, from this observation [..., V, F] and those before."""
         assert state is not None
-        boxes, tracks = self.assumed.boxes(observation), state.get("tracks", None)
-        return boxes if tracks is None else narrowed(boxes, tracks)
+        return self.assumed.boxes(observation, state.get("tracks", None))
 
     def _estimate(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         """The observation [..., V, F] with the middles of the boxes and the reckoned ego."""

@@ -1,4 +1,4 @@
-"""The boxes of shown observations as one compiled loop, with the slope of each bound in the value behind it."""
+"""The boxes of shown observations as compiled loops, with the slope of each bound in the value behind it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavbench.compiled import entry_point
-from cavbench.driving.intervals.kernels import Floats
+from cavbench.driving.intervals.kernels import Flags, Floats
 
 
 class Set(NamedTuple):
@@ -64,3 +64,58 @@ def boxes(shown: Floats, of: Set, low: Floats, high: Floats, slopes: Floats) -> 
                         most = np.float32(1) / (of.larger[f] if near > far else of.smaller[f])
                     slopes[0, n, row, f] = np.float32(0) if open_below else least * half
                     slopes[1, n, row, f] = np.float32(0) if open_above else most * half
+
+
+@entry_point
+def narrow(
+    shown: Floats, track_low: Floats, track_high: Floats, tracked: Flags, low: Floats, high: Floats, slopes: Floats
+) -> None:
+    """The boxes of other cars, each intersected with the hull of all tracks that it may belong to, in place.
+
+    Args:
+        shown: observations [N, V, F].
+        track_low, track_high: bounds of the tracks, [N, K, F - 1].
+        tracked: the tracks that exist, [N, K].
+        low, high, slopes: as `boxes` filled them. The slope of a bound that is moved is 0.
+    """
+    features, sloped = low.shape[2], slopes.shape[1] > 0
+    least, most = np.empty(features, np.float32), np.empty(features, np.float32)
+    for n in range(len(low)):
+        for box in range(1, low.shape[1]):
+            # New cars appear where the sensor's range ends.
+            if not (shown[n, box, 0] > 0 and np.isfinite(high[n, box, 0])):
+                continue
+            least[:], most[:] = np.inf, -np.inf
+            fits_any = False
+            for track in range(track_low.shape[1]):
+                fits = tracked[n, track]
+                for f in range(features):
+                    if not fits:
+                        break
+                    fits = low[n, box, f] <= track_high[n, track, f] and track_low[n, track, f] <= high[n, box, f]
+                if fits:
+                    fits_any = True
+                    for f in range(features):
+                        least[f] = min(least[f], track_low[n, track, f])
+                        most[f] = max(most[f], track_high[n, track, f])
+            for f in range(features):
+                lower, upper = max(low[n, box, f], least[f]), min(high[n, box, f], most[f])
+                if not (fits_any and lower <= upper):
+                    continue
+                if sloped and lower > low[n, box, f]:
+                    slopes[0, n, box, f] = 0
+                if sloped and upper < high[n, box, f]:
+                    slopes[1, n, box, f] = 0
+                low[n, box, f], high[n, box, f] = lower, upper
+
+
+@entry_point
+def boxes_backward(slopes: Floats, by_low: Floats, by_high: Floats, by_shown: Floats) -> None:
+    """The gradient in the shown observations [N, V, F], filled, from those in the bounds [N, V, F - 1]."""
+    for n in range(len(by_shown)):
+        for row in range(by_shown.shape[1]):
+            by_shown[n, row, 0] = 0
+            for f in range(by_low.shape[2]):
+                by_shown[n, row, f + 1] = (
+                    by_low[n, row, f] * slopes[0, n, row, f] + by_high[n, row, f] * slopes[1, n, row, f]
+                )

@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from tensordict import TensorDictBase
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -49,7 +51,7 @@ class Assumed:
     budget: float
     noise: float = 0.0
 
-    def boxes(self, shown: Tensor) -> Boxes:
+    def boxes(self, shown: Tensor, tracks: TensorDictBase | None = None) -> Boxes:
         """The true values from which the set leads to the shown ones: the inverse of `ObservationThreat.radius`.
 
         With the norm `relative` a shown z stands for true values in [min(z - f, z / (1 +- b)), max(z + f, z / (1 -+ b))], where
@@ -58,8 +60,12 @@ class Assumed:
 
         Args:
             shown: the observation that the policy received, [..., V, F], on the normalised scale.
+            tracks: the boxes that `tracks.predicted` gave for the same episodes; each other car's box is intersected with the
+                hull of all those that it may belong to. The hull makes it sound where a measurement fits several cars. A box
+                that fits none stays, and so does a feature whose intersection is empty.
         """
-        low, high = _Boxes.apply(shown, self._set)
+        known = () if tracks is None else (tracks["low"], tracks["high"], tracks["present"])
+        low, high = _Boxes.apply(shown, self._set, known)
         return Boxes(shown[..., 0] > 0, low, high)
 
     @cached_property
@@ -83,19 +89,39 @@ class Assumed:
 
 class _Boxes(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, shown: Tensor, of: box_kernels.Set) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, shown: Tensor, of: box_kernels.Set, tracks: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         rows, size = shown.shape[-2:]
-        given = shown.detach().float().cpu().reshape(shown.shape[:-2].numel(), rows, size).contiguous().numpy()
+        given = flat(shown, 2)
         low, high = np.empty((2, len(given), rows, size - 1), np.float32)
         slopes = np.empty((2, len(given) if shown.requires_grad else 0, rows, size - 1), np.float32)
         box_kernels.boxes(given, of, low, high, slopes)
-        if shown.requires_grad:
-            ctx.slopes = torch.from_numpy(slopes).to(shown).view(2, *shown.shape[:-1], size - 1)
-        lower, upper = (torch.from_numpy(each).to(shown).view(*shown.shape[:-1], size - 1) for each in (low, high))
-        return lower, upper
+        if tracks:
+            lower, upper, tracked = tracks
+            box_kernels.narrow(given, flat(lower, 2), flat(upper, 2), flat(tracked, 1), low, high, slopes)
+        ctx.kept = slopes, shown.shape, shown.new_empty(0)
+        return shaped(low, shown.shape[:-2], shown), shaped(high, shown.shape[:-2], shown)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, by_low: Tensor, by_high: Tensor) -> tuple[Tensor, None]:
-        lower, upper = ctx.slopes
-        return torch.nn.functional.pad(by_low * lower + by_high * upper, (1, 0)), None
+    def backward(ctx: Any, by_low: Tensor, by_high: Tensor) -> tuple[Tensor, None, None]:
+        slopes, shape, like = ctx.kept
+        by_shown = np.empty((*slopes.shape[1:-1], shape[-1]), np.float32)
+        box_kernels.boxes_backward(slopes, flat(by_low, 2), flat(by_high, 2), by_shown)
+        return shaped(by_shown, shape[:-2], like), None, None
+
+
+def flat(tensor: Tensor, kept: int) -> NDArray[Any]:
+    """The values [N, ...] of a tensor, with all but the last `kept` dimensions in one; numbers as float32."""
+    values = tensor.detach().cpu()
+    if values.dtype != torch.bool:
+        values = values.float()
+    leading = tensor.ndim - kept
+    if leading != 1:
+        values = values.reshape(tensor.shape[:leading].numel(), *tensor.shape[leading:])
+    found: NDArray[Any] = values.contiguous().numpy()
+    return found
+
+
+def shaped(values: NDArray[Any], leading: torch.Size, like: Tensor) -> Tensor:
+    """A tensor [*leading, ...] of values [N, ...]."""
+    return torch.from_numpy(values).to(like).reshape(*leading, *values.shape[1:])

@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.features import ActionType
 from cavbench.driving.intervals import motion_kernels
-from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.boxes import Boxes, flat
+from cavbench.driving.intervals.motion_kernels import OFF_THE_ROAD, SLACK, UNKNOWN_EDGE
 from cavbench.driving.kinematics import Kinematics
-
-UNKNOWN_EDGE = 64
-"""The rightmost lane, as long as the car has not found it by steering towards a lane that does not exist."""
-OFF_THE_ROAD = 0.3
-"""A lane does not exist if the measured place stays this far to the left of the reckoned one, in m."""
-
-SLACK = 1.0
-"""The reckoned place and speed are corrected if they are farther outside of the measured box than this, in m and m/s."""
 
 ORDER = ("FASTER", "IDLE", "SLOWER", "LANE_LEFT", "LANE_RIGHT")
 """The order in which margins are computed; `DeadReckoning.order` leads from it to the world's actions."""
@@ -49,7 +43,21 @@ class Ego(NamedTuple):
 
 def stacked(ego: Ego) -> Tensor:
     """The fields of egos [N] as one tensor [N, 6], for the compiled loops; a copy without a gradient."""
-    return torch.stack([one.detach().float().cpu() for one in ego], -1)
+    return torch.stack(tuple(ego), -1).detach().float().cpu()
+
+
+def predicted(state: TensorDictBase) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
+    """A state of N episodes for the compiled loops: the egos [N, 6], whether they are known, and their cosines and sines [N, 2].
+
+    These are torch's own functions: those of the compiled code may differ in the last bit.
+    """
+    fields = dict(state.items())
+    known, egos = (
+        flat(fields["known"], 0),
+        stacked(Ego(*(fields[name] for name in Ego._fields))).view(-1, len(Ego._fields)),
+    )
+    heading = egos[:, motion_kernels.HEADING].contiguous()
+    return egos.numpy(), known, torch.stack((heading.cos(), heading.sin()), -1).numpy()
 
 
 def _middle(low: Tensor, high: Tensor) -> Tensor:
@@ -113,23 +121,34 @@ class DeadReckoning:
 
     def after(self, ego: Ego, action: Tensor) -> TensorDict:
         """The state after an action, int64 [B] or float [B, 2]; without a gradient."""
-        moved = stacked(ego)
+        return self._after(stacked(ego).numpy(), action, ego.y)
+
+    def step(self, boxes: Boxes, state: TensorDictBase, action: Tensor) -> tuple[Ego, TensorDict]:
+        """`now`, and the state `after` an action; without a gradient, in one pass."""
+        egos = np.empty((len(boxes.low), len(Ego._fields)), np.float32)
+        motion_kernels.reckon(*predicted(state), flat(boxes.low, 2), flat(boxes.high, 2), self.car, egos)
+        now = Ego(*torch.from_numpy(egos.T.copy()).to(boxes.low).unbind(0))
+        return now, self._after(egos, action, boxes.low)
+
+    def _after(self, egos: NDArray[Any], action: Tensor, like: Tensor) -> TensorDict:
+        """The state after an action; moves the egos [B, 6]."""
         if self.action_type == "continuous":
-            motion_kernels.steered(moved.numpy(), action.detach().float().cpu().contiguous().numpy(), self._car)
+            motion_kernels.steered(egos, action.detach().float().cpu().contiguous().numpy(), self.car)
         else:
-            orders, turns = self._changes[action.cpu()].unbind(-1)
-            motion_kernels.driven(moved.numpy(), orders.numpy(), turns.numpy(), self._car)
-        fields = dict(zip(Ego._fields, moved.T.contiguous().to(ego.y).unbind(0), strict=True))
-        return TensorDict({**fields, "known": torch.ones_like(ego.y, dtype=torch.bool)}, batch_size=ego.y.shape)
+            orders, turns = self._changes[:, action.cpu()].numpy()
+            motion_kernels.driven(egos, orders, turns, self.car)
+        moved = torch.from_numpy(egos.T.copy()).to(like)
+        fields = dict(zip(Ego._fields, moved.unbind(0), strict=True))
+        return TensorDict({**fields, "known": moved.new_ones(len(egos), dtype=torch.bool)}, batch_size=[len(egos)])
 
     @cached_property
     def _changes(self) -> Tensor:
-        """[A, 2] how each discrete action changes the target speed and the target lane."""
+        """[2, A] how each discrete action changes the target speed and the target lane."""
         changes = {"FASTER": (1, 0), "SLOWER": (-1, 0), "LANE_RIGHT": (0, 1), "LANE_LEFT": (0, -1)}
-        return torch.tensor([changes.get(name, (0, 0)) for name in self.numbers])
+        return torch.tensor([changes.get(name, (0, 0)) for name in self.numbers]).T.contiguous()
 
     @cached_property
-    def _car(self) -> motion_kernels.Car:
+    def car(self) -> motion_kernels.Car:
         """The kinematics as the compiled loops take them."""
         car = self.kinematics
         low, high, last = car.target_speeds[0], car.target_speeds[-1], len(car.target_speeds) - 1
@@ -160,8 +179,12 @@ class DeadReckoning:
 
     def speed_after(self, speed: Tensor, target: Tensor) -> Tensor:
         """The speed [...] in m/s after one decision towards the target speed [...]."""
-        kept = (1 - self.kinematics.speed_gain * self.dt) ** self.kinematics.frames
-        return target + (speed - target) * kept
+        return target + (speed - target) * self.kept
+
+    @property
+    def kept(self) -> float:
+        """The share of the difference to the target speed that is left after one decision."""
+        return (1 - self.kinematics.speed_gain * self.dt) ** self.kinematics.frames
 
     def steering(self, ego: Ego, place: Tensor) -> Tensor:
         """ControlledVehicle.steering_control: the steering angle [...] in rad towards a place across the road, in m."""

@@ -123,7 +123,7 @@ def _lost(closing: float, slowing: float, rules: Rules) -> tuple[float, float]:
     c s + c^2 / 2a - d T (1 - exp(-t / T)).
     """
     faster = slowing + max(closing, 0.0)
-    left = slowing * np.exp(-(REAR_S + faster / REAR_BRAKING) / rules.delay)
+    left = slowing * np.exp(-(REAR_S + faster / REAR_BRAKING) / rules.delay) if slowing > 0 else 0.0
     lost = faster * (REAR_S + faster / (2 * REAR_BRAKING)) - rules.delay * (slowing - left)
     return max(lost, 0.0), (REAR_S + (faster - left) / REAR_BRAKING if closing > 0 and lost > 0 else 0.0)
 
@@ -158,7 +158,7 @@ def rooms(
         slowing: by how much the ego slows down after that, in m/s, at least 0, [N, O].
         tables: following distances [T, levels * side * side].
         side: number of speeds in a table.
-        asked: the pairs of table and option whose room is computed, [T, O].
+        asked: the pairs of table and option whose room is computed, [N, T, O], or [1, T, O] for all points.
         rules: see `Rules`.
         front, front_car: room [N, T, 3, O] from -`FREE` to `FREE`, and the car that limits it or `NOBODY`.
         rear, rear_car: the same of the cars behind, [N, 3, O].
@@ -166,6 +166,7 @@ def rooms(
     """
     options = own.shape[1]
     for n in range(len(low)):
+        which = n if len(asked) > 1 else 0
         front[n], front_car[n], rear[n], rear_car[n] = FREE, NOBODY, FREE, NOBODY
         for car in range(low.shape[1]):
             if not present[n, car]:
@@ -181,7 +182,7 @@ def rooms(
                 level[n, car] = _level(low[n], high[n], present[n], car, rules)
                 for table in range(len(tables)):
                     for option in range(options):
-                        if not asked[table, option]:
+                        if not asked[which, table, option]:
                             continue
                         room = gap - used(tables[table], side, own[n, option], leader, level[n, car])[0]
                         for beside in range(3):
@@ -191,8 +192,11 @@ def rooms(
                                 front_car[n, table, beside, option] = car
             else:
                 closing = high[n, car, 2] - own[n, rules.steady]
+                lost = 0.0
                 for option in range(options):
-                    room = -high[n, car, 0] - rules.length - _lost(closing, slowing[n, option], rules)[0]
+                    if option == 0 or slowing[n, option] != slowing[n, option - 1]:
+                        lost = _lost(closing, slowing[n, option], rules)[0]
+                    room = -high[n, car, 0] - rules.length - lost
                     for beside in range(3):
                         middle = nearest + beside * rules.lane_width
                         if _overlap(left, right, middle, rules.width) and room < rear[n, beside, option]:
@@ -305,47 +309,3 @@ def _to_bounds(low: Floats, high: Floats, f: int, slope: float, by_low: Floats, 
         by_low[f] += slope / finite
     if np.isfinite(high[f]):
         by_high[f] += slope / finite
-
-
-@entry_point
-def hulls(
-    low: Floats,
-    high: Floats,
-    known: Flags,
-    track_low: Floats,
-    track_high: Floats,
-    tracked: Flags,
-    out_low: Floats,
-    out_high: Floats,
-) -> None:
-    """Each box, intersected with the hull of all tracks that it may belong to; fills `out_low` and `out_high` [N, C, F].
-
-    Args:
-        low, high: bounds of the boxes, [N, C, F].
-        known: [N, C], the boxes that may belong to a track.
-        track_low, track_high: bounds of the tracks, [N, K, F].
-        tracked: [N, K], the tracks that exist.
-        out_low, out_high: the narrowed bounds. A box that fits no track stays, and so does a feature whose intersection is empty.
-    """
-    features = low.shape[2]
-    least, most = np.empty(features, np.float32), np.empty(features, np.float32)
-    for n in range(len(low)):
-        for box in range(low.shape[1]):
-            least[:], most[:] = np.inf, -np.inf
-            fits_any = False
-            for track in range(track_low.shape[1]):
-                fits = known[n, box] and tracked[n, track]
-                for f in range(features):
-                    if not fits:
-                        break
-                    fits = low[n, box, f] <= track_high[n, track, f] and track_low[n, track, f] <= high[n, box, f]
-                if fits:
-                    fits_any = True
-                    for f in range(features):
-                        least[f] = min(least[f], track_low[n, track, f])
-                        most[f] = max(most[f], track_high[n, track, f])
-            for f in range(features):
-                lower, upper = max(low[n, box, f], least[f]), min(high[n, box, f], most[f])
-                keep = fits_any and lower <= upper
-                out_low[n, box, f] = lower if keep else low[n, box, f]
-                out_high[n, box, f] = upper if keep else high[n, box, f]

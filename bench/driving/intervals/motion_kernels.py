@@ -8,10 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point, inner
-from cavbench.driving.intervals.kernels import Floats
+from cavbench.driving.intervals.kernels import Flags, Floats
 
 Y, HEADING, SPEED, LANE, TARGET, EDGE = range(6)
 """The fields of `cavbench.driving.intervals.ego.Ego`."""
+
+
+SLACK = 1.0
+"""The reckoned place and speed are corrected if they are farther outside of the measured box than this, in m and m/s."""
+OFF_THE_ROAD = 0.3
+"""A lane does not exist if the measured place stays this far to the left of the reckoned one, in m."""
+UNKNOWN_EDGE = 64
+"""The rightmost lane, as long as the car has not found it by steering towards a lane that does not exist."""
 
 
 class Car(NamedTuple):
@@ -22,7 +30,7 @@ class Car(NamedTuple):
         last: number of the highest target speed.
         dt: seconds per frame.
         half_length: half the length of a car, in m.
-        lane_width, top_speed, speed_gain, heading_gain, lateral_gain, max_heading, max_steering: as there.
+        start_speed, lane_width, top_speed, speed_gain, heading_gain, lateral_gain, max_heading, max_steering: as there.
         acceleration_limit, steering_limit: as there.
         lowest, range: the lowest target speed, and the highest less the lowest, in m/s.
         spacing: from one target speed to the next, in m/s.
@@ -32,6 +40,7 @@ class Car(NamedTuple):
     last: int
     dt: np.float32
     half_length: np.float32
+    start_speed: np.float32
     lane_width: np.float32
     top_speed: np.float32
     speed_gain: np.float32
@@ -47,9 +56,10 @@ class Car(NamedTuple):
 
 
 @inner
-def _clipped(value: np.float32, low: np.float32, high: np.float32) -> np.float32:
-    """`value` between the bounds; NaN stays."""
-    return low if value < low else high if value > high else value
+def clamped(value: np.float32, low: np.float32, high: np.float32) -> np.float32:
+    """`torch.clamp`: between the bounds, of which the upper one wins; NaN stays."""
+    value = low if value < low else value
+    return high if value > high else value
 
 
 @inner
@@ -57,11 +67,11 @@ def _steering(ego: Floats, car: Car) -> np.float32:
     """ControlledVehicle.steering_control towards the middle of the target lane, in rad."""
     one, speed = np.float32(1), max(ego[SPEED], np.float32(0.01))
     lateral = ego[Y] - car.lane_width * ego[LANE]
-    wanted = np.arcsin(_clipped(-car.lateral_gain * lateral / speed, -one, one))
-    wanted = _clipped(wanted, -car.max_heading, car.max_heading)
+    wanted = np.arcsin(clamped(-car.lateral_gain * lateral / speed, -one, one))
+    wanted = clamped(wanted, -car.max_heading, car.max_heading)
     rate = car.heading_gain * (wanted - ego[HEADING])
-    slip = np.arcsin(_clipped(car.half_length / speed * rate, -one, one))
-    return _clipped(np.arctan(np.float32(2) * np.tan(slip)), -car.max_steering, car.max_steering)
+    slip = np.arcsin(clamped(car.half_length / speed * rate, -one, one))
+    return clamped(np.arctan(np.float32(2) * np.tan(slip)), -car.max_steering, car.max_steering)
 
 
 @inner
@@ -74,6 +84,64 @@ def _move(ego: Floats, acceleration: np.float32, steering: np.float32, car: Car)
     ego[Y] += speed * np.sin(heading + slip) * car.dt
     ego[HEADING] = heading + speed * np.sin(slip) / car.half_length * car.dt
     ego[SPEED] = speed + acceleration * car.dt
+
+
+@inner
+def corrected(
+    ego: Floats, known: bool, low: Floats, high: Floats, car: Car, now: Floats, turned: Floats, slopes: Floats
+) -> None:
+    """`DeadReckoning.now`: fills `now` [6] and `slopes`.
+
+    Args:
+        ego, known: the predicted ego [6], and whether there is one.
+        low, high: the box of the measured row, [4].
+        car: the kinematics.
+        now: the ego.
+        turned: cosine and sine of the predicted heading; changed where the heading is.
+        slopes: of y in the bounds of y, then of the speed in those of vx, [4].
+    """
+    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    slack, off, edge = np.float32(SLACK), np.float32(OFF_THE_ROAD), np.float32(UNKNOWN_EDGE)
+    below, above = low[1], high[1]
+    now[:], slopes[:] = ego, zero
+    if not known:
+        first = np.rint(
+            ((below if np.isfinite(below) else above) / two + (above if np.isfinite(above) else below) / two)
+            / car.lane_width
+        )
+        first = zero if first < zero else first
+        now[Y], now[SPEED], now[LANE], now[TARGET] = first * car.lane_width, car.start_speed, first, car.start_speed
+        now[EDGE] = edge
+        return
+    least, most = low[2] - slack, high[2] + slack
+    along, forward = ego[SPEED] * turned[0], turned[0] if turned[0] > np.float32(0.1) else np.float32(0.1)
+    now[SPEED] = clamped(along, least, most) / forward
+    slopes[2] = one / forward if along < least < most else zero
+    slopes[3] = one / forward if along > most or most < least else zero
+    if ego[Y] > above + off and ego[LANE] * car.lane_width > above:
+        now[EDGE] = ego[LANE] - one
+        now[Y], now[HEADING], turned[0], turned[1] = now[EDGE] * car.lane_width, zero, one, zero
+    else:
+        left, right = below - slack, above + slack
+        now[Y] = clamped(ego[Y], left, right)
+        slopes[0] = one if ego[Y] < left < right else zero
+        slopes[1] = one if ego[Y] > right or right < left else zero
+    now[LANE] = now[EDGE] if now[EDGE] < ego[LANE] else ego[LANE]
+
+
+@entry_point
+def reckon(predicted: Floats, known: Flags, turned: Floats, low: Floats, high: Floats, car: Car, egos: Floats) -> None:
+    """The egos at an observation; fills `egos` [N, 6].
+
+    Args:
+        predicted, known: the predicted egos [N, 6], and whether there is one, [N].
+        turned: cosine and sine of their headings, [N, 2]; changed where a heading is.
+        low, high: the boxes, [N, V, 4], of which the ego's is read.
+        car: the kinematics.
+    """
+    slopes = np.empty(4, np.float32)
+    for n in range(len(egos)):
+        corrected(predicted[n], known[n], low[n, 0], high[n, 0], car, egos[n], turned[n], slopes)
 
 
 @entry_point
@@ -91,8 +159,8 @@ def driven(egos: Floats, orders: NDArray[np.int64], turns: NDArray[np.int64], ca
         ego = egos[n]
         if orders[n] != 0:
             index = np.rint((ego[SPEED] - car.lowest) / car.range * top)
-            index = _clipped(index, np.float32(0), top) + np.float32(orders[n])
-            ego[TARGET] = car.lowest + _clipped(index, np.float32(0), top) * car.spacing
+            index = clamped(index, np.float32(0), top) + np.float32(orders[n])
+            ego[TARGET] = car.lowest + clamped(index, np.float32(0), top) * car.spacing
         lane = min(max(ego[LANE] + np.float32(turns[n]), np.float32(0)), ego[EDGE])
         # A lane farther away than two lane widths cannot be chosen (highway-env's AbstractLane.is_reachable_from).
         if np.abs(ego[Y] - car.lane_width * lane) <= np.float32(2) * car.lane_width:
@@ -106,8 +174,8 @@ def steered(egos: Floats, controls: Floats, car: Car) -> None:
     """The egos [N, 6] one decision later, in place, after acceleration and steering `controls` [N, 2] in [-1, 1]."""
     one = np.float32(1)
     for n in range(len(egos)):
-        acceleration = _clipped(controls[n, 0], -one, one) * car.acceleration_limit
-        steering = _clipped(controls[n, 1], -one, one) * car.steering_limit
+        acceleration = clamped(controls[n, 0], -one, one) * car.acceleration_limit
+        steering = clamped(controls[n, 1], -one, one) * car.steering_limit
         for _ in range(car.frames):
             _move(egos[n], acceleration, steering, car)
         lane = max(np.rint(egos[n, Y] / car.lane_width), np.float32(0))

@@ -99,3 +99,8 @@ def corrected(observation: Tensor, ego: Ego, assumed: Assumed) -> Tensor:
 def with_inner(own: Mapping[str, Tensor | TensorDictBase], inner: State, shape: torch.Size) -> TensorDict:
     """The state of a defence: its own entries, and the state of the policy behind it as `inner`, if that has one."""
     return TensorDict({**own, **({} if inner is None else {"inner": inner})}, batch_size=shape)
+
+
+def remembers(policy: Policy) -> bool:
+    """Whether a policy has an `advance` of its own: that of the others leaves their state as it is, and needs no observation."""
+    return type(policy).advance is not Policy.advance

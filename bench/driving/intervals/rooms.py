@@ -8,12 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from cavbench.driving.intervals import kernels
-from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.boxes import Boxes, flat, shaped
 from cavbench.driving.intervals.ego import DeadReckoning, Ego
 from cavbench.driving.intervals.following import FollowingDistance
 
@@ -123,18 +122,6 @@ class Rooms:
         return fastest
 
 
-def met(low: Tensor, high: Tensor, known: Tensor, tracks: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """The bounds [..., C, F], each intersected with the hull of all tracks that it may belong to.
-
-    Args:
-        low, high: bounds of the boxes, [..., C, F].
-        known: bool [..., C], the boxes that may belong to a track.
-        tracks: bounds of the tracks [..., K, F] each, and which exist, bool [..., K].
-    """
-    found: tuple[Tensor, Tensor] = _Hulls.apply(low, high, known, *tracks)
-    return found
-
-
 class _Rooms(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -149,22 +136,22 @@ class _Rooms(torch.autograd.Function):
         of: Rooms,
     ) -> tuple[Tensor, Tensor]:
         shape, options, tables = along.shape, own.shape[-1], len(of.following.tables)
-        flat = _flat(low, 2), _flat(high, 2), _flat(along, 0), _flat(own, 1)
-        slower, (count, cars) = _flat(slowing, 1), flat[0].shape[:2]
+        given = flat(low, 2), flat(high, 2), flat(along, 0), flat(own, 1)
+        slower, (count, cars) = flat(slowing, 1), given[0].shape[:2]
         front = np.empty((count, tables, 3, options), np.float32)
         rear = np.empty((count, 3, options), np.float32)
         found = np.empty(front.shape, np.int8), np.empty(rear.shape, np.int8), np.zeros((count, cars), np.int8)
         kernels.rooms(
-            flat[0],
-            flat[1],
-            _flat(present, 1),
-            flat[2],
-            _flat(lane, 0),
-            flat[3],
+            given[0],
+            given[1],
+            flat(present, 1),
+            given[2],
+            flat(lane, 0),
+            given[3],
             slower,
             of.following.tables,
             of.following.side,
-            of.asked,
+            of.asked[None],
             of.rules,
             front,
             found[0],
@@ -172,9 +159,9 @@ class _Rooms(torch.autograd.Function):
             found[1],
             found[2],
         )
-        ctx.of, ctx.flat, ctx.slower, ctx.found = of, flat, slower, found
+        ctx.of, ctx.flat, ctx.slower, ctx.found = of, given, slower, found
         ctx.shapes, ctx.like = [each.shape for each in (low, high, along, own)], low.new_empty(0)
-        return _shaped(front, shape, low), _shaped(rear, shape, low)
+        return shaped(front, shape, low), shaped(rear, shape, low)
 
     @staticmethod
     @once_differentiable
@@ -187,8 +174,8 @@ class _Rooms(torch.autograd.Function):
             ctx.of.following.side,
             ctx.of.rules,
             *ctx.found,
-            _flat(by_front, 3),
-            _flat(by_rear, 2),
+            flat(by_front, 3),
+            flat(by_rear, 2),
             *gradients,
         )
         back = [torch.from_numpy(each).to(ctx.like).reshape(to) for each, to in zip(gradients, ctx.shapes, strict=True)]
@@ -198,49 +185,17 @@ class _Rooms(torch.autograd.Function):
 class _Speeds(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, low: Tensor, high: Tensor, present: Tensor, lane: Tensor, of: Rooms) -> Tensor:
-        flat = _flat(low, 2), _flat(high, 2)
-        fastest = np.empty((len(flat[0]), len(kernels.SIDES)), np.float32)
+        given = flat(low, 2), flat(high, 2)
+        fastest = np.empty((len(given[0]), len(kernels.SIDES)), np.float32)
         car = np.empty(fastest.shape, np.int8)
-        kernels.speeds(*flat, _flat(present, 1), _flat(lane, 0), of.rules, of.top, fastest, car)
-        ctx.flat, ctx.car, ctx.shape, ctx.like = flat, car, low.shape, low.new_empty(0)
-        return _shaped(fastest, lane.shape, low)
+        kernels.speeds(*given, flat(present, 1), flat(lane, 0), of.rules, of.top, fastest, car)
+        ctx.flat, ctx.car, ctx.shape, ctx.like = given, car, low.shape, low.new_empty(0)
+        return shaped(fastest, lane.shape, low)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_fastest: Tensor) -> tuple[Tensor | None, ...]:
         by_low, by_high = (np.zeros_like(each) for each in ctx.flat)
-        kernels.speeds_backward(*ctx.flat, ctx.car, _flat(by_fastest, 1), by_low, by_high)
+        kernels.speeds_backward(*ctx.flat, ctx.car, flat(by_fastest, 1), by_low, by_high)
         back = [torch.from_numpy(each).to(ctx.like).reshape(ctx.shape) for each in (by_low, by_high)]
         return *back, None, None, None
-
-
-class _Hulls(torch.autograd.Function):
-    @staticmethod
-    def forward(
-        ctx: Any, low: Tensor, high: Tensor, known: Tensor, track_low: Tensor, track_high: Tensor, tracked: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        flat = _flat(low, 2), _flat(high, 2)
-        out = np.empty_like(flat[0]), np.empty_like(flat[1])
-        kernels.hulls(*flat, _flat(known, 1), _flat(track_low, 2), _flat(track_high, 2), _flat(tracked, 1), *out)
-        lower, upper = (_shaped(each, low.shape[:-2], low) for each in out)
-        # The gradient goes to the bounds that were not moved.
-        ctx.save_for_backward(lower == low, upper == high)
-        return lower, upper
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, by_low: Tensor, by_high: Tensor) -> tuple[Tensor | None, ...]:
-        own_low, own_high = ctx.saved_tensors
-        return by_low * own_low, by_high * own_high, None, None, None, None
-
-
-def _flat(tensor: Tensor, kept: int) -> NDArray[Any]:
-    """The values [N, ...] of a tensor, with all but the last `kept` dimensions in one; numbers as float32."""
-    values = tensor.detach() if tensor.dtype == torch.bool else tensor.detach().float()
-    flat: NDArray[Any] = values.reshape(-1, *tensor.shape[tensor.ndim - kept :]).contiguous().cpu().numpy()
-    return flat
-
-
-def _shaped(values: NDArray[Any], leading: torch.Size, like: Tensor) -> Tensor:
-    """A tensor [*leading, ...] of values [N, ...]."""
-    return torch.from_numpy(values).to(like).reshape(*leading, *values.shape[1:])

@@ -12,7 +12,6 @@ from torch import Tensor
 from cavbench.driving.intervals import motion_kernels
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego, stacked
-from cavbench.driving.intervals.rooms import met
 from cavbench.driving.kinematics import Kinematics
 
 LONGITUDINAL, LATERAL = 6.0, 40.0
@@ -51,20 +50,3 @@ def _limits(car: Kinematics, period: float) -> motion_kernels.Limits:
     slipping = car.length / 2 * LATERAL
     found = period, LONGITUDINAL * period, LATERAL * period, slipping, LARGEST_SLIP, ROUNDING
     return motion_kernels.Limits(*map(np.float32, found))
-
-
-def narrowed(boxes: Boxes, tracks: TensorDictBase) -> Boxes:
-    """The boxes [..., V, 4], each intersected with the hull of all predicted boxes that it may belong to.
-
-    The hull makes it sound where a measurement fits several cars. A box that fits none, or whose intersection is empty, stays.
-
-    Args:
-        tracks: the result of `predicted` for the same episodes.
-    """
-    # New cars appear where the sensor's range ends.
-    known = boxes.present[..., 1:] & boxes.high[..., 1:, 0].isfinite()
-    low, high = met(
-        boxes.low[..., 1:, :], boxes.high[..., 1:, :], known, (tracks["low"], tracks["high"], tracks["present"])
-    )
-    ego_low, ego_high = boxes.low[..., :1, :], boxes.high[..., :1, :]
-    return Boxes(boxes.present, torch.cat((ego_low, low), -2), torch.cat((ego_high, high), -2))

@@ -104,7 +104,7 @@ class IntervalPlanner(IntervalPolicy):
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
-        return self.reckoning.after(self.reckoning.now(boxes, state), action)
+        return self.reckoning.step(boxes, state, action)[1]
 
     def _worth(self, ego: Ego, speed: Tensor) -> Tensor:
         """[..., 3] the progress on the left, own and right lane, or on a lane beyond it less the detour."""

@@ -1,0 +1,146 @@
+"""The filter of discrete actions in compiled calls, forward and backward; torch computes whatever they are not made for."""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from cavbench.driving.intervals import filter_kernels, margins
+from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
+from cavbench.driving.intervals.ego import predicted
+
+
+class Weighed(NamedTuple):
+    """What a filter makes of an observation.
+
+    Args:
+        seen: the observation with the reckoned ego, [..., V, F].
+        margins: those of FASTER, IDLE, SLOWER and of both lane changes, ways out included, in m, [..., 5].
+        hard: 1 for the actions that are allowed and 0 for the others, in the same order, [..., 5].
+        safe: bool [...], whether any action is.
+    """
+
+    seen: Tensor
+    margins: Tensor
+    hard: Tensor
+    safe: Tensor
+
+
+class Mask:
+    """The same as `ego.DeadReckoning.now`, `policy.corrected`, `margins.Judge` and the mask of a filter.
+
+    Its answers are those of torch to the last bit, its gradients to rounding.
+
+    Args:
+        judge: the judge, with the ego's kinematics.
+        assumed: the assumed perturbation set, with the features.
+        band: margin of FASTER in m from which on slower actions are masked.
+        softness: width in m over which the gradient of the mask is spread.
+    """
+
+    def __init__(self, judge: margins.Judge, assumed: Assumed, band: float, softness: float) -> None:
+        self.judge, self.assumed, self.band, self.softness = judge, assumed, band, softness
+
+    def fits(self, observation: Tensor, state: TensorDictBase) -> bool:
+        """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
+        if observation.dtype != torch.float32 or observation.device.type != "cpu" or torch.compiler.is_compiling():
+            return False
+        if observation.shape[-2] < 2 or torch._C._are_functorch_transforms_active():
+            return False
+        return state.batch_size == observation.shape[:-2]
+
+    def __call__(self, observation: Tensor, boxes: Boxes, ego: TensorDictBase) -> Weighed:
+        """What the filter makes of observations that it `fits`, differentiable once in them and in the boxes.
+
+        Args:
+            observation: as shown, [..., V, F].
+            boxes: their boxes, [..., V, F - 1].
+            ego: the reckoned ego, a state as of `DeadReckoning.after`.
+        """
+        return Weighed(*_Weigh.apply(observation, boxes.low, boxes.high, boxes.present, ego, self))
+
+    def lowered(self, values: Tensor, weighed: Weighed) -> Tensor:
+        """The scores [..., A], lowered for the actions that are not allowed; `values` are those of the policy behind."""
+        if values.dtype != torch.float32 or values.device.type != "cpu":
+            soft = weighed.margins.div(self.softness).sigmoid()
+            allowed = (weighed.hard + soft - soft.detach())[..., self.judge.reckoning.order]
+            return values - ((values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1) * (
+                1 - allowed
+            )
+        scores: Tensor = _Lower.apply(values, weighed.margins, weighed.hard, self)
+        return scores
+
+    @cached_property
+    def facts(self) -> filter_kernels.Facts:
+        """The world and the constants as the compiled loops take them."""
+        reckoning, features = self.judge.reckoning, self.assumed.features
+        least, most = np.array(features.low, np.float32), np.array(features.high, np.float32)
+        single = {
+            "kept": reckoning.kept,
+            "settled_m": margins.SETTLED_M,
+            "settled_rad": margins.SETTLED_RAD,
+            "clearing_m": margins.CLEARING_M,
+            "band": self.band,
+        }
+        numbers = {name: np.float32(value) for name, value in single.items()}
+        return filter_kernels.Facts(reckoning.car, margins.PARTS, low=least, span=most - least, **numbers)
+
+    @cached_property
+    def order(self) -> np.ndarray[Any, np.dtype[np.int64]]:
+        """The place of each action of the world in `ego.ORDER`."""
+        return np.array(self.judge.reckoning.order, np.int64)
+
+    @property
+    def tables(self) -> tuple[Any, int]:
+        """The following distances, and the number of speeds in one of them."""
+        following = self.judge.rooms.following
+        return following.tables, following.side
+
+
+class _Weigh(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, observation: Tensor, low: Tensor, high: Tensor, present: Tensor, ego: TensorDictBase, of: Mask
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        leading, (tables, side), rooms = observation.shape[:-2], of.tables, of.judge.rooms
+        given = flat(observation, 2), flat(present, 1), *predicted(ego), flat(low, 2), flat(high, 2)
+        *found, kept = filter_kernels.weigh(*given, tables, side, rooms.asked, rooms.rules, of.facts)
+        ctx.of, ctx.kept, ctx.shape = of, kept, observation.shape
+        seen, margin, hard, safe = map(torch.from_numpy, found)
+        answers = seen.view(observation.shape), margin.view(*leading, 5), hard.view(*leading, 5), safe.view(leading)
+        ctx.mark_non_differentiable(*answers[2:])
+        return answers
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_seen: Tensor, by_margins: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
+        rooms = ctx.of.judge.rooms
+        given = flat(by_seen, 2), flat(by_margins, 1), *ctx.of.tables
+        found = filter_kernels.weigh_backward(*given, rooms.rules, ctx.of.facts, ctx.kept)
+        by_shown, by_low, by_high = map(torch.from_numpy, found)
+        box = *ctx.shape[:-1], ctx.shape[-1] - 1
+        return by_shown.view(ctx.shape), by_low.view(box), by_high.view(box), None, None, None
+
+
+class _Lower(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, margin: Tensor, hard: Tensor, of: Mask) -> Tensor:
+        given, soft = flat(values, 1), flat(margin.detach().div(of.softness).sigmoid(), 1)
+        out, spread = np.empty_like(given), np.empty(len(given), np.float32)
+        filter_kernels.masked(given, flat(hard, 1), soft, of.order, out, spread)
+        ctx.of, ctx.kept, ctx.shape = of, (soft, spread), margin.shape
+        return torch.from_numpy(out).view(values.shape)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        soft, spread = ctx.kept
+        by_x = np.empty_like(soft)
+        filter_kernels.masked_backward(flat(by_out, 1), soft, spread, ctx.of.order, np.float32(ctx.of.softness), by_x)
+        return by_out, torch.from_numpy(by_x).view(ctx.shape), None, None

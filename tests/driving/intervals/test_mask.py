@@ -1,0 +1,173 @@
+"""The compiled filter: torch's answers to the last bit and torch's gradients, in every batch, and torch where more is wanted."""
+
+from __future__ import annotations
+
+from unittest.mock import patch
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from cavbench.defenses.driving.shield import Shield, Shielded
+from cavbench.defenses.driving.tracker import Tracked, Tracker
+from cavbench.driving import Policy
+from cavbench.driving.intervals import filter_kernels
+from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.mask import Mask
+from cavbench.driving.victims.networks import QPolicy
+from tests.driving.intervals.drivers import FACTS
+
+ROWS = 6
+
+
+def shielded(policy: Policy | None = None) -> Shielded:
+    torch.manual_seed(3)
+    return Shielded(Shield(), policy or QPolicy(5, len(FACTS.actions), 16).requires_grad_(False), FACTS).eval()
+
+
+def drawn(seed: int, count: int) -> tuple[Tensor, TensorDict]:
+    """Observations and states with cars on every side, and with what makes a kink: rows that are missing or at the end of the
+    sensor's range, egos that are unknown, between two lanes, as fast as they want to be, or off from what was measured."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def among(*values: float) -> Tensor:
+        return torch.tensor(values)[torch.randint(len(values), (count,), generator=generator)]
+
+    def between(low: float, high: float, *shape: int) -> Tensor:
+        return low + (high - low) * torch.rand(count, *shape, generator=generator)
+
+    lane, speed = among(0, 1, 2, 3), torch.where(among(0, 1) > 0, among(20, 25, 30), between(10, 32))
+    ego = Ego(
+        y=4 * lane + among(0, 0, 0.3, -0.8, 1.5, -2.0, 3.0),
+        heading=among(0, 0, 0.05, -0.2),
+        speed=speed,
+        target_lane=lane,
+        target_speed=among(20, 25, 30),
+        edge=among(2, 3, 64).maximum(lane),
+    )
+    place, width = (
+        torch.stack([between(-40, 80, ROWS), 4 * between(-2, 3, ROWS).floor()], -1),
+        FACTS.features.half_range(),
+    )
+    motion = torch.stack([between(-8, 8, ROWS), among(0, 0.4, -1.5)[:, None].expand(-1, ROWS)], -1)
+    shown = torch.cat((place, motion), -1) / width
+    measured = torch.stack([among(0.3, 1, -0.5), ego.y / width[1], ego.speed / width[2], ego.heading], -1)
+    shown[:, 0] = measured + among(0, 0, 0.01, -0.1, 0.1)[:, None]
+    present = (torch.rand(count, ROWS, generator=generator) < 0.8) | (torch.arange(ROWS) == 0)
+    present[: count // 8, 1:] = False
+    shown = torch.cat((present.float().unsqueeze(-1), torch.where(present.unsqueeze(-1), shown.clamp(-1, 1), 0.0)), -1)
+    known = among(0, 1, 1, 1) > 0
+    return shown, TensorDict({"ego": TensorDict({**ego._asdict(), "known": known}, [count])}, [count])
+
+
+def by_torch() -> object:
+    return patch.object(Mask, "fits", lambda self, observation, state: False)
+
+
+def found(policy: Shielded, shown: Tensor, boxes: Boxes, state: TensorDict) -> list[Tensor]:
+    """The scores, what is passed on, what is left, and whether any action is safe."""
+    return [policy.weighed(shown, boxes, state), *policy.filtered(shown, boxes, state), policy.safe(boxes, state)]  # type: ignore[list-item]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_answers_are_those_of_torch_to_the_last_bit(seed: int) -> None:
+    policy, (shown, state) = shielded(), drawn(seed, 300)
+    boxes = policy.assumed.boxes(shown)
+    with patch.object(filter_kernels, "weigh", side_effect=filter_kernels.weigh) as compiled:
+        compiled_ones = found(policy, shown, boxes, state)
+        assert compiled.call_count == 3
+        with by_torch():
+            reference = found(policy, shown, boxes, state)
+        assert compiled.call_count == 3
+    for one, other in zip(compiled_ones, reference, strict=True):
+        assert torch.equal(one, other)
+    margins = policy.mask(shown, boxes, state["ego"])
+    judged = policy.margins(policy.ego(boxes, state), boxes)
+    assert torch.equal(margins.margins, torch.cat((judged.stay, judged.worth_changing), -1))
+    assert torch.equal(margins.safe, judged.safe)
+    # The states above reach what a filter decides about.
+    assert 0.1 < float(judged.safe.float().mean()) < 0.95
+    assert 0.1 < float(margins.hard.mean()) < 0.9
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_gradients_are_those_of_torch(seed: int) -> None:
+    policy, (shown, state) = shielded(), drawn(seed, 300)
+    weights = torch.randn(300, len(FACTS.actions), generator=torch.Generator().manual_seed(seed))
+
+    def slope() -> Tensor:
+        asked = shown.clone().requires_grad_()
+        scores = policy.weighed(asked, policy.assumed.boxes(asked), state)
+        return torch.autograd.grad((scores * weights).sum(), asked)[0]
+
+    compiled = slope()
+    with by_torch():
+        reference = slope()
+    largest = reference.abs().flatten(1).amax(1)
+    assert float(largest.median()) > 0.1
+    apart = (compiled - reference).abs().flatten(1).amax(1)
+    assert float((apart <= 1e-6 * largest).float().mean()) > 0.97
+    # Both round: where large terms cancel, more of what is left is rounding.
+    assert bool((apart <= 1e-5 * (largest + 1)).all())
+
+
+def test_a_row_has_the_same_bits_in_every_batch_and_place() -> None:
+    policy, (shown, state) = shielded(), drawn(1, 120)
+
+    def both(rows: Tensor) -> tuple[Tensor, Tensor]:
+        asked = shown[rows].requires_grad_()
+        scores = policy.weighed(asked, policy.assumed.boxes(asked), state[rows])
+        return scores.detach(), torch.autograd.grad(scores.sum(), asked)[0]
+
+    scores, slopes = both(torch.arange(120))
+    for rows in (torch.arange(120).flip(0), torch.tensor([7]), torch.arange(40, 73), torch.tensor([5, 5, 90])):
+        part, slope = both(rows)
+        assert torch.equal(part, scores[rows])
+        assert torch.equal(slope, slopes[rows])
+
+
+def test_several_leading_dimensions_and_no_points_are_answered() -> None:
+    policy, (shown, state) = shielded(), drawn(2, 60)
+    flat = policy.weighed(shown, policy.assumed.boxes(shown), state)
+    folded = shown.unflatten(0, (4, 15))
+    assert torch.equal(policy.weighed(folded, policy.assumed.boxes(folded), state.reshape(4, 15)).flatten(0, 1), flat)
+    assert policy.weighed(shown[:0], policy.assumed.boxes(shown[:0]), state[:0]).shape == (0, len(FACTS.actions))
+
+
+@pytest.mark.parametrize("wanted", [torch.float64, torch.float32])
+def test_torch_answers_for_another_precision(wanted: torch.dtype) -> None:
+    class Wide(Policy):
+        action_type = "discrete"
+
+        def forward(self, observation: Tensor) -> Tensor:
+            return observation.flatten(-2)[..., : len(FACTS.actions)].double()
+
+    policy, (shown, state) = shielded(Wide()), drawn(4, 40)
+    asked = shown.to(wanted)
+    with patch.object(filter_kernels, "weigh", side_effect=filter_kernels.weigh) as compiled:
+        scores = policy.weighed(asked, policy.assumed.boxes(asked), state)
+        assert compiled.call_count == (wanted == torch.float32)
+    assert scores.dtype == torch.float64
+    with by_torch():
+        torch.testing.assert_close(scores, policy.weighed(asked, policy.assumed.boxes(asked), state))
+
+
+def test_a_tracked_filter_drives_as_by_torch() -> None:
+    """Scores and states over several decisions, with the boxes of the tracker in front."""
+    shown, _ = drawn(5, 80)
+    policy = Tracked(Tracker(), shielded(), FACTS).eval()
+    state = other = policy.initial(torch.arange(80))
+    for step in range(6):
+        moved = shown.clone()
+        moved[..., 1] = (moved[..., 1] + 0.002 * step * moved[..., 0]).clamp(-1, 1)
+        scores = policy.scores(moved, state)
+        with by_torch():
+            assert torch.equal(policy.scores(moved, other), scores)
+            other = policy.advance(moved, scores.argmax(-1), other)
+        state = policy.advance(moved, scores.argmax(-1), state)
