@@ -64,7 +64,8 @@ class Assumed:
                 hull of all those that it may belong to. The hull makes it sound where a measurement fits several cars. A box
                 that fits none stays, and so does a feature whose intersection is empty.
         """
-        known = () if tracks is None else (tracks["low"], tracks["high"], tracks["present"])
+        fields = {} if tracks is None else dict(tracks.items())
+        known = tuple(fields[name] for name in ("low", "high", "present")) if fields else ()
         low, high = _Boxes.apply(shown, self._set, known)
         return Boxes(shown[..., 0] > 0, low, high)
 

@@ -32,7 +32,8 @@ def predicted(boxes: Boxes, before: Ego, after: TensorDictBase, car: Kinematics,
         car: kinematics of the world's cars.
         period: seconds per decision.
     """
-    then = Ego(*(after[name] for name in Ego._fields))
+    fields = dict(after.items())
+    then = Ego(*(fields[name] for name in Ego._fields))
     low, high = (one.detach().float().cpu().contiguous().numpy() for one in (boxes.low, boxes.high))
     lower, upper = np.empty((2, len(low), low.shape[1] - 1, low.shape[2]), np.float32)
     motion_kernels.later(low, high, stacked(before).numpy(), stacked(then).numpy(), _limits(car, period), lower, upper)
