@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -43,6 +43,9 @@ class Mask:
         band: margin of FASTER in m from which on slower actions are masked.
         softness: width in m over which the gradient of the mask is spread.
     """
+
+    marked: ClassVar[tuple[str, ...]] = ("judge", "assumed", "band", "softness", "facts", "order")
+    """What the watch compares (`cavbench.isolation.watch.marks`)."""
 
     def __init__(self, judge: margins.Judge, assumed: Assumed, band: float, softness: float) -> None:
         self.judge, self.assumed, self.band, self.softness = judge, assumed, band, softness

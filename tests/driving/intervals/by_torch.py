@@ -87,3 +87,16 @@ def predicted(found: Boxes, before: Ego, then: Ego, car: Kinematics, period: flo
     lower = torch.stack([x_low, y_low, vx, vy_low], -1)
     upper = torch.stack([x_high + fastest * period, y_high, fastest, vy_high], -1)
     return lower - there.unsqueeze(-2) - ROUNDING, upper - there.unsqueeze(-2) + ROUNDING
+
+
+def narrowed(found: Boxes, low: Tensor, high: Tensor, tracked: Tensor) -> Boxes:
+    """`Assumed.boxes` with tracks: bounds [N, K, F] each, and which exist, [N, K]."""
+    own = found.low[:, 1:, None], found.high[:, 1:, None]
+    known = found.present[:, 1:] & found.high[:, 1:, 0].isfinite()
+    fits = (own[0] <= high[:, None]) & (low[:, None] <= own[1])
+    fits = (fits.all(-1) & known.unsqueeze(-1) & tracked[:, None]).unsqueeze(-1)
+    lower = torch.maximum(found.low[:, 1:], torch.where(fits, low[:, None], torch.inf).amin(2))
+    upper = torch.minimum(found.high[:, 1:], torch.where(fits, high[:, None], -torch.inf).amax(2))
+    keep = fits.any(2) & (lower <= upper)
+    lower, upper = torch.where(keep, lower, found.low[:, 1:]), torch.where(keep, upper, found.high[:, 1:])
+    return Boxes(found.present, torch.cat((found.low[:, :1], lower), 1), torch.cat((found.high[:, :1], upper), 1))

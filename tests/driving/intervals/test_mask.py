@@ -19,6 +19,7 @@ from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego
 from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.victims.networks import QPolicy
+from tests.driving.intervals import by_torch as by_torch_code
 from tests.driving.intervals.drivers import FACTS
 
 ROWS = 6
@@ -156,6 +157,31 @@ def test_torch_answers_for_another_precision(wanted: torch.dtype) -> None:
     assert scores.dtype == torch.float64
     with by_torch():
         torch.testing.assert_close(scores, policy.weighed(asked, policy.assumed.boxes(asked), state))
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_boxes_within_tracks_and_their_gradients_are_those_of_torch(seed: int) -> None:
+    assumed, (shown, _) = shielded().assumed, drawn(seed, 100)
+    generator = torch.Generator().manual_seed(seed)
+    near = assumed.boxes(shown)
+    shift = torch.randn(100, ROWS - 1, 4, generator=generator)
+    low, high = near.low[:, 1:] + shift, near.high[:, 1:] + shift * torch.rand(shift.shape, generator=generator)
+    tracked = torch.rand(100, ROWS - 1, generator=generator) < 0.8
+    tracks = TensorDict({"low": low, "high": high, "present": tracked}, [100])
+    asked, other = shown.clone().requires_grad_(), shown.clone().requires_grad_()
+    found, wanted = assumed.boxes(asked, tracks), by_torch_code.narrowed(assumed.boxes(other), low, high, tracked)
+    assert torch.equal(found.low, wanted.low)
+    assert torch.equal(found.high, wanted.high)
+    assert not torch.equal(found.low, near.low)
+    weights = torch.randn(2, *found.low.shape, generator=generator)
+
+    def slope(boxes: Boxes, of: Tensor) -> Tensor:
+        bounds = torch.stack((boxes.low, boxes.high))
+        return torch.autograd.grad((torch.where(bounds.isfinite(), bounds, 0.0) * weights).sum(), of)[0]
+
+    # At a tie torch halves the gradient; no two bounds here are equal.
+    torch.testing.assert_close(slope(found, asked), slope(wanted, other), atol=1e-5, rtol=1e-6)
 
 
 def test_a_tracked_filter_drives_as_by_torch() -> None:
