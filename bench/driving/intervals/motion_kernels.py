@@ -30,7 +30,8 @@ class Car(NamedTuple):
         last: number of the highest target speed.
         dt: seconds per frame.
         half_length: half the length of a car, in m.
-        start_speed, lane_width, top_speed, speed_gain, heading_gain, lateral_gain, max_heading, max_steering: as there.
+        start_speed: as there; NaN if the ego starts at any.
+        lane_width, top_speed, speed_gain, heading_gain, lateral_gain, max_heading, max_steering: as there.
         acceleration_limit, steering_limit: as there.
         lowest, range: the lowest target speed, and the highest less the lowest, in m/s.
         spacing: from one target speed to the next, in m/s.
@@ -87,6 +88,32 @@ def _move(ego: Floats, acceleration: np.float32, steering: np.float32, car: Car)
 
 
 @inner
+def _middle(low: np.float32, high: np.float32) -> np.float32:
+    """The middle of an interval; of one that is open at an end, the other end."""
+    two = np.float32(2)
+    return (low if np.isfinite(low) else high) / two + (high if np.isfinite(high) else low) / two
+
+
+@inner
+def _middle_slopes(low: np.float32, high: np.float32, slopes: Floats) -> None:
+    """The slopes of `_middle` in both ends, [2]."""
+    half = np.float32(0.5)
+    slopes[:] = np.float32(0)
+    slopes[0 if np.isfinite(low) else 1] += half
+    slopes[1 if np.isfinite(high) else 0] += half
+
+
+@inner
+def _nearest_target(speed: np.float32, car: Car) -> np.float32:
+    """The target speed next to a speed; the lower one of two."""
+    nearest = car.lowest
+    for number in range(1, car.last + 1):
+        target = car.lowest + np.float32(number) * car.spacing
+        nearest = target if abs(speed - target) < abs(speed - nearest) else nearest
+    return nearest
+
+
+@inner
 def corrected(
     ego: Floats, known: bool, low: Floats, high: Floats, car: Car, now: Floats, turned: Floats, slopes: Floats
 ) -> None:
@@ -100,18 +127,22 @@ def corrected(
         turned: cosine and sine of the predicted heading; changed where the heading is.
         slopes: of y in the bounds of y, then of the speed in those of vx, [4].
     """
-    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    zero, one = np.float32(0), np.float32(1)
     slack, off, edge = np.float32(SLACK), np.float32(OFF_THE_ROAD), np.float32(UNKNOWN_EDGE)
     below, above = low[1], high[1]
     now[:], slopes[:] = ego, zero
     if not known:
-        first = np.rint(
-            ((below if np.isfinite(below) else above) / two + (above if np.isfinite(above) else below) / two)
-            / car.lane_width
-        )
+        middle = _middle(below, above)
+        first = np.rint(middle / car.lane_width)
         first = zero if first < zero else first
-        now[Y], now[SPEED], now[LANE], now[TARGET] = first * car.lane_width, car.start_speed, first, car.start_speed
-        now[EDGE] = edge
+        now[LANE], now[EDGE] = first, edge
+        if np.isfinite(car.start_speed):
+            now[Y], now[SPEED], now[TARGET] = first * car.lane_width, car.start_speed, car.start_speed
+            return
+        now[Y], now[SPEED] = middle, _middle(low[2], high[2])
+        now[TARGET] = _nearest_target(now[SPEED], car)
+        _middle_slopes(below, above, slopes[:2])
+        _middle_slopes(low[2], high[2], slopes[2:])
         return
     least, most = low[2] - slack, high[2] + slack
     along, forward = ego[SPEED] * turned[0], turned[0] if turned[0] > np.float32(0.1) else np.float32(0.1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import pytest
@@ -25,9 +26,13 @@ from tests.driving.intervals.drivers import FACTS
 ROWS = 6
 
 
-def shielded(policy: Policy | None = None) -> Shielded:
+def shielded(policy: Policy | None = None, *, any_start: bool = False) -> Shielded:
+    """A filter, in a world where the ego starts at the world's speed, or at any."""
     torch.manual_seed(3)
-    return Shielded(Shield(), policy or QPolicy(5, len(FACTS.actions), 16).requires_grad_(False), FACTS).eval()
+    assert FACTS.kinematics is not None
+    kinematics = replace(FACTS.kinematics, start_speed=None if any_start else FACTS.kinematics.start_speed)
+    behind = policy or QPolicy(5, len(FACTS.actions), 16).requires_grad_(False)
+    return Shielded(Shield(), behind, replace(FACTS, kinematics=kinematics)).eval()
 
 
 def drawn(seed: int, count: int) -> tuple[Tensor, TensorDict]:
@@ -75,9 +80,9 @@ def found(policy: Shielded, shown: Tensor, boxes: Boxes, state: TensorDict) -> l
 
 
 @settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_answers_are_those_of_torch_to_the_last_bit(seed: int) -> None:
-    policy, (shown, state) = shielded(), drawn(seed, 300)
+@given(seed=st.integers(0, 10_000), any_start=st.booleans())
+def test_answers_are_those_of_torch_to_the_last_bit(seed: int, any_start: bool) -> None:
+    policy, (shown, state) = shielded(any_start=any_start), drawn(seed, 300)
     boxes = policy.assumed.boxes(shown)
     with patch.object(filter_kernels, "weigh", side_effect=filter_kernels.weigh) as compiled:
         compiled_ones = found(policy, shown, boxes, state)
@@ -97,9 +102,9 @@ def test_answers_are_those_of_torch_to_the_last_bit(seed: int) -> None:
 
 
 @settings(max_examples=15, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_gradients_are_those_of_torch(seed: int) -> None:
-    policy, (shown, state) = shielded(), drawn(seed, 300)
+@given(seed=st.integers(0, 10_000), any_start=st.booleans())
+def test_gradients_are_those_of_torch(seed: int, any_start: bool) -> None:
+    policy, (shown, state) = shielded(any_start=any_start), drawn(seed, 300)
     weights = torch.randn(300, len(FACTS.actions), generator=torch.Generator().manual_seed(seed))
 
     def slope() -> Tensor:
