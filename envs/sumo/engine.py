@@ -24,15 +24,13 @@ from cavbench.envs.highway.dynamics import (
     update_direction,
     wrap_to_pi,
 )
-from cavbench.envs.highway.ego import apply_action, score, time_to_collision
+from cavbench.envs.highway.ego import apply_action, score
 from cavbench.envs.highway.engine import (
     HighwayEngine,
     check_seeds,
     observe_batch,
     physical_controls,
-    report,
 )
-from cavbench.envs.highway.observation import observe
 from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.state import EgoKind, Episode, Floats, Integers, Parameters, Vehicle, Vehicles
 from cavbench.envs.sumo.cars import PERIOD_MS, Model, start
@@ -160,30 +158,6 @@ def judge(
             score(cars, episode, parameters)
 
 
-@entry_point
-def tell_batch(
-    vehicles: NDArray[np.void],
-    order: Integers,
-    episodes: NDArray[np.void],
-    moved: NDArray[np.bool_],
-    parameters: Parameters,
-    observation: NDArray[np.float32],
-    numbers: NDArray[np.float32],
-    flags: NDArray[np.bool_],
-) -> None:
-    """Write what the episodes `moved` [B] show after an action; all others have no reward and no progress."""
-    rows = np.empty(observation.shape[1] - 1, np.int64)
-    measured = np.empty(4)
-    for number in range(episodes.size):
-        if not moved[number]:
-            numbers[:2, number] = 0.0
-            continue
-        cars, sequence, episode = vehicles[number], order[number], episodes[number]
-        episode.ttc = time_to_collision(cars, sequence)
-        observe(cars, sequence, episode, parameters, rows, measured, observation[number])
-        report(cars[0], episode, numbers, flags, number)
-
-
 class SumoEngine(HighwayEngine):
     """B episodes of `config`, whose traffic SUMO drives.
 
@@ -250,7 +224,9 @@ class SumoEngine(HighwayEngine):
             # SUMO need not drive what nobody sees any more.
             self.processes.remove(np.flatnonzero(moving & self._ended()))
         outputs = self.observation, self.numbers, self.flags
-        tell_batch(self.vehicles, self.order, self.episodes, moved, self.parameters, *outputs)
+        # All others have no reward and no progress.
+        self.numbers[:2, ~moved] = 0.0
+        observe_batch(self.vehicles, self.order, self.episodes, np.flatnonzero(moved), self.parameters, *outputs)
 
     def _ended(self) -> NDArray[np.bool_]:
         """[B] whether an episode is over, or was never started."""
