@@ -19,6 +19,8 @@ TYPES = {"f4": "<f4", "f8": "<f8", "u1": "u1"}
 """Types of the arrays that are read, by their names in a pickle."""
 MOST = 2**20
 """Operations that a pickle may have."""
+KEYS = (str, bytes, int, float, type(None))
+"""Types of the keys of a dict."""
 ERRORS = (ValueError, IndexError, KeyError, TypeError, AttributeError, EOFError, OverflowError, MemoryError)
 """What reading a damaged pickle raises."""
 
@@ -167,6 +169,9 @@ def _append(machine: _Machine, items: list[Any]) -> None:
 
 
 def _set(machine: _Machine, items: list[Any]) -> None:
+    # Nor has the hash of a tuple of tuples.
+    if not all(isinstance(key, KEYS) for key in items[::2]):
+        raise ValueError("a key that is neither a text nor a number")
     pairs = dict(zip(items[::2], items[1::2], strict=True))
     target = machine.stack[-1]
     # An OrderedDict, for instance, is filled like a dict.
@@ -187,6 +192,9 @@ def _global(machine: _Machine, argument: str) -> None:
 
 def _stack_global(machine: _Machine, argument: Any) -> None:
     module, name = machine.pop(2)
+    # The text of a list that holds itself many times over has no end.
+    if not (isinstance(module, str) and isinstance(name, str)):
+        raise ValueError("a name that is no text")
     machine.stack.append(Named(f"{module}.{name}"))
 
 
