@@ -107,7 +107,7 @@ def array(made: Any) -> NDArray[Any] | None:
                 pass
             case _:
                 return None
-        kind = TYPES[dtype.args[0]]
+        kind = TYPES[_text(dtype.args[0])]
         return np.frombuffer(bytes(content), kind).reshape(shape, order=order)  # type: ignore[call-overload]
     except ERRORS:
         return None
@@ -133,6 +133,13 @@ def floats(pickled: str, size: int) -> NDArray[np.float32] | None:
         if found is not None and found.size % size == 0 and found.size
         else None
     )
+
+
+def _text(value: Any) -> str:
+    """A name. Of a list that holds itself many times over neither the text nor the hash has an end."""
+    if not isinstance(value, str):
+        raise TypeError("a name that is no text")
+    return value
 
 
 def _is(name: str, function: str) -> bool:
@@ -169,7 +176,7 @@ def _append(machine: _Machine, items: list[Any]) -> None:
 
 
 def _set(machine: _Machine, items: list[Any]) -> None:
-    # Nor has the hash of a tuple of tuples.
+    # As in `_text`: the hash of a tuple of tuples has no end.
     if not all(isinstance(key, KEYS) for key in items[::2]):
         raise ValueError("a key that is neither a text nor a number")
     pairs = dict(zip(items[::2], items[1::2], strict=True))
@@ -192,10 +199,7 @@ def _global(machine: _Machine, argument: str) -> None:
 
 def _stack_global(machine: _Machine, argument: Any) -> None:
     module, name = machine.pop(2)
-    # The text of a list that holds itself many times over has no end.
-    if not (isinstance(module, str) and isinstance(name, str)):
-        raise ValueError("a name that is no text")
-    machine.stack.append(Named(f"{module}.{name}"))
+    machine.stack.append(Named(f"{_text(module)}.{_text(name)}"))
 
 
 OPERATIONS: dict[str, Callable[[_Machine, Any], None]] = {
