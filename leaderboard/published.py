@@ -25,12 +25,14 @@ import pyarrow.parquet as pq
 from rich.console import Console
 
 from cavbench.core import suites
+from cavbench.core.registry import Kind
 from cavbench.core.track import Track, track, tracks
 from cavbench.errors import UserError
 from cavbench.files import whole
 from cavbench.identity.fingerprint import canonical
-from cavbench.leaderboard.comparisons.comparison import DEFENDED, IDENTITY, NO_ATTACK
+from cavbench.leaderboard.comparisons.comparison import DEFENDED, IDENTITY, NO_ATTACK, parameters
 from cavbench.leaderboard.comparisons.reading import groups
+from cavbench.leaderboard.comparisons.typed import typed
 from cavbench.leaderboard.faces import write_face
 from cavbench.leaderboard.ranking.faults import FAULT
 from cavbench.records import reading
@@ -75,7 +77,7 @@ def publish(folder: Path, home: Path, *, add: bool = False) -> dict[str, int]:
         folder: what `bench run out=` was given.
         home: where `data` and `rows` are, usually the folder `leaderboard`.
         add: keep the records that a row has of all pairs, training seeds and grids of which the folder has fewer episodes.
-            Those of baselines are always kept.
+            Those of baselines are always kept. Those from before a component got another parameter are of other pairs, and go.
 
     Returns:
         How many episodes each file has then, by `GRID/NAME`.
@@ -87,7 +89,7 @@ def publish(folder: Path, home: Path, *, add: bool = False) -> dict[str, int]:
     for track_name, records in reading.read_all(folder).items():
         for grid, defended, part in _rows(records, track(track_name)):
             file = _file(home / "data" / grid, defended)
-            if file.exists() and (add or defended is None):
+            if file.exists() and (defended is None or (add and _defended(file) == defended)):
                 part = added(reading.read_file(file), part)
             write_records(part, file)
             if defended is not None:
@@ -144,10 +146,22 @@ def _file(folder: Path, defended: Mapping[str, object] | None) -> Path:
     plain = folder / f"{'+'.join(names)}.parquet"
     if not plain.exists():
         return plain
-    there = pq.read_table(plain, columns=list(DEFENDED)).slice(0, 1).to_pylist()
-    if there == [dict(defended)]:
+    # A parameter that came later, with its default, makes no other row.
+    if _typed(_defended(plain)) == _typed(defended):
         return plain
     return plain.with_stem(f"{plain.stem}-{hashlib.sha256(canonical(defended).encode()).hexdigest()[:8]}")
+
+
+def _defended(file: Path) -> Mapping[str, object]:
+    """Whose records a published file of a row has."""
+    return dict(pq.read_table(file, columns=list(DEFENDED)).slice(0, 1).to_pylist()[0])
+
+
+def _typed(defended: Mapping[str, object]) -> list[tuple[str, dict[str, object]]]:
+    """The names of what is defended, and what somebody types for each."""
+    kinds: tuple[Kind, ...] = ("defense", "victim", "world")
+    names = {kind: str(defended[kind]) for kind in kinds}
+    return [(name, typed(kind, name, parameters(defended[f"{kind}_params"]))) for kind, name in names.items()]
 
 
 def write_records(records: pa.Table, file: Path) -> None:

@@ -27,6 +27,7 @@ from cavbench.envs.highway.dynamics import (
 from cavbench.envs.highway.ego import apply_action, score
 from cavbench.envs.highway.engine import (
     HighwayEngine,
+    Number,
     check_seeds,
     observe_batch,
     physical_controls,
@@ -225,7 +226,7 @@ class SumoEngine(HighwayEngine):
             self.processes.remove(np.flatnonzero(moving & self._ended()))
         outputs = self.observation, self.numbers, self.flags
         # All others have no reward and no progress.
-        self.numbers[:2, ~moved] = 0.0
+        self.numbers[Number.REWARD, ~moved] = self.numbers[Number.PROGRESS, ~moved] = 0.0
         observe_batch(self.vehicles, self.order, self.episodes, np.flatnonzero(moved), self.parameters, *outputs)
 
     def _ended(self) -> NDArray[np.bool_]:

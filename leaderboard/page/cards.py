@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
 
@@ -15,8 +15,9 @@ import pyarrow.compute as pc
 
 from cavbench.core import registry, sets
 from cavbench.core.registry import KINDS, Kind
-from cavbench.core.sources import defaults_of, summary
+from cavbench.core.sources import summary
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison, parameters
+from cavbench.leaderboard.comparisons.typed import typed
 from cavbench.records.table import group_codes
 
 DEFAULTS = {("attack", "none"), ("defense", "none"), ("victim", "dqn"), ("world", "highway")}
@@ -76,7 +77,7 @@ def run_command(one: Comparison) -> str:
     words = []
     for kind in KINDS:
         words += [f"{kind}={identity[kind]}"] if (kind, identity[kind]) not in DEFAULTS else []
-        given = _given(kind, str(identity[kind]), parameters(identity[f"{kind}_params"]))
+        given = typed(kind, str(identity[kind]), parameters(identity[f"{kind}_params"]))
         words += [f"{kind}.{name}={_word(value)}" for name, value in given.items()]
     if one.is_attacked:
         # Every frame is the default, and tracks without frames do not know the option.
@@ -88,26 +89,6 @@ def run_command(one: Comparison) -> str:
     named = {grid.name for grid in registry.grids(str(identity["world"]))}
     words += [f"grid={name}" for name in _values(one.own.table, "grid") if name in named]
     return shlex.join(["bench", "run", *words, *_part(one)])
-
-
-def _given(kind: Kind, name: str, params: Mapping[str, object]) -> dict[str, object]:
-    """The parameters without those that the source says are the defaults, which nobody types.
-
-    An empty one is typed where it is not the default. Those of a link of a chain are `LINK.NAME`.
-    """
-    found = {}
-    for key, value in params.items():
-        link, _, own = key.rpartition(".")
-        claims = registry.entries(registry.GROUPS[kind]).get(link or name.partition(":")[0], ())
-        defaults = defaults_of(claims[0].target) if len(claims) == 1 else {}
-        if own not in defaults or repr(_plain(defaults[own])) != repr(value):
-            found[key] = value
-    return found
-
-
-def _plain(value: object) -> object:
-    """A default as the JSON of a record has it."""
-    return list(map(_plain, value)) if isinstance(value, tuple) else value
 
 
 def _part(one: Comparison) -> list[str]:

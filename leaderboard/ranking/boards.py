@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, get_args
 
 import pyarrow as pa
@@ -71,7 +72,7 @@ class Row:
         """Whether its attacks were crafted once, on a track whose attacks are crafted: another patch may take more or less."""
         return self.worst.most.track.artefact is not None and len(self.worst.scores) == 1
 
-    @property
+    @cached_property
     def hopeless(self) -> bool:
         """Whether its victim does nothing without an attack, so that its score says nothing."""
         most = self.worst.most

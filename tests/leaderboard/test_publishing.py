@@ -69,6 +69,21 @@ def test_rows_of_one_name_have_a_file_each(tmp_path: Path) -> None:
     assert len(list((tmp_path / "rows" / GRID.name).glob("dqn*.json"))) == 2
 
 
+def test_a_parameter_that_came_later_makes_no_other_row(tmp_path: Path) -> None:
+    """The old records go: their pairs have other names, so both together would be a row of two defences."""
+    old, new = (
+        {"defense": "shield", "defense_params": params} for params in ({"band": 0.0}, {"band": 0.0, "distance": 0.4})
+    )
+    publish(ran(tmp_path / "old", row(**old)), tmp_path)
+    publish(ran(tmp_path / "new", row(**new)), tmp_path, add=True)
+    (file,) = (tmp_path / "data" / GRID.name).glob("dqn+shield*.parquet")
+    assert [json.loads(one) for one in set(reading.read_file(file)["defense_params"].to_pylist())] == [
+        new["defense_params"]
+    ]
+    publish(ran(tmp_path / "other", row(**{**new, "defense_params": {"distance": 0.5}})), tmp_path, add=True)
+    assert len(list((tmp_path / "data" / GRID.name).glob("dqn+shield*.parquet"))) == 2
+
+
 def test_a_face_says_the_score_and_its_records(tmp_path: Path) -> None:
     publish(ran(tmp_path / "out", row(0.1)), tmp_path)
     face = json.loads((tmp_path / "rows" / GRID.name / "dqn.json").read_text())

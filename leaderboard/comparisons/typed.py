@@ -1,0 +1,29 @@
+"""What somebody types to get a component: its parameters without the defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from cavbench.core import registry
+from cavbench.core.registry import Kind
+from cavbench.core.sources import defaults_of
+
+
+def typed(kind: Kind, name: str, params: Mapping[str, object]) -> dict[str, object]:
+    """The parameters without those that the source says are the defaults, which nobody types.
+
+    An empty one is typed where it is not the default. Those of a link of a chain are `LINK.NAME`.
+    """
+    found = {}
+    for key, value in params.items():
+        link, _, own = key.rpartition(".")
+        claims = registry.entries(registry.GROUPS[kind]).get(link or name.partition(":")[0], ())
+        defaults = defaults_of(claims[0].target) if len(claims) == 1 else {}
+        if own not in defaults or repr(_plain(defaults[own])) != repr(value):
+            found[key] = value
+    return found
+
+
+def _plain(value: object) -> object:
+    """A default as the JSON of a record has it."""
+    return list(map(_plain, value)) if isinstance(value, tuple) else value
