@@ -9,6 +9,12 @@ from pathlib import Path
 from cavbench.run.process import settle
 
 FIGURES = {
+    "finding_attacks.png": "findings:attacks",
+    "finding_filters.png": "findings:filters",
+    "finding_faults.png": "findings:faults",
+    "finding_trainings.png": "findings:trainings",
+    "finding_detectors.png": "findings:detectors",
+    "finding_patches.png": "findings:patches",
     "attack_none.svg": "attacks:none",
     "attack_noise.svg": "attacks:noise",
     "attack_bias.svg": "memory:bias",
@@ -75,7 +81,7 @@ FIGURES = {
     "world_racetrack.svg": "roads:racetrack",
     "world_u_turn.svg": "roads:u_turn",
     "world_sumo.svg": "sumo:sumo",
-    "world_camera.png": "camera:world",
+    "world_camera.webp": "camera:world",
     "world_crossing.png": "crossing:world",
     "world_places.png": "camera:places",
     "world_windscreen.png": "camera:windscreen",

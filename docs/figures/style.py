@@ -26,12 +26,14 @@ INK, GREY, FAINT, GROUND = "#222222", "#767676", "#d9d9d4", "#fcfcfa"
 TRUE, SHOWN = BLUE, RED
 """Colours of the measured and of the attacked observation."""
 UNDEFENDED, HARDENED = RED, GREEN
+FAULT = PURPLE
+"""Colour of what happens without an adversary."""
 ACTIONS = {"LANE_LEFT": PURPLE, "IDLE": GREY, "LANE_RIGHT": ORANGE, "FASTER": RED, "SLOWER": BLUE}
 """Colours by name of the action, in the order of `cavbench.envs.highway.config.ACTIONS`."""
 
 WIDTH = 6.0
 """Width of a figure in inches."""
-PNG_DPI, PNG_COLOURS = 110, 96
+PNG_DPI, PNG_COLOURS, WEBP_QUALITY = 110, 96, 80
 
 STYLE = {
     "svg.hashsalt": "cavbench",
@@ -83,7 +85,7 @@ def bare(axes: Axes) -> None:
 
 
 def save(made: Figure, path: Path) -> None:
-    """Write a figure as SVG or PNG, the same bytes every time."""
+    """Write a figure as SVG, PNG or, for photographs, WebP: the same bytes every time."""
     if path.suffix == ".svg":
         drawn = io.StringIO()
         made.savefig(drawn, format="svg", metadata={"Date": None, "Creator": None})
@@ -93,7 +95,11 @@ def save(made: Figure, path: Path) -> None:
         return
     drawn = io.BytesIO()
     made.savefig(drawn, format="png", dpi=PNG_DPI)
-    Image.open(drawn).convert("RGB").quantize(PNG_COLOURS).save(path, optimize=True)
+    image = Image.open(drawn).convert("RGB")
+    if path.suffix == ".webp":
+        image.save(path, quality=WEBP_QUALITY, method=6)
+    else:
+        image.quantize(PNG_COLOURS).save(path, optimize=True)
 
 
 def _joined(commands: re.Match[str]) -> str:

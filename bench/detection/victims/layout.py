@@ -82,6 +82,15 @@ def named(shapes: Sequence[Sequence[int]]) -> tuple[str, ...]:
     return coco.NAMES
 
 
+def with_no_object(names: tuple[str, ...], shapes: Sequence[Sequence[int]]) -> tuple[str, ...]:
+    """Class names, with "no object" at the end if outputs with these shapes have one class more, as DETR's have."""
+    more = not layout_of(shapes, len(names)) and layout_of(shapes, len(names) + 1) in (
+        "boxes and scores",
+        "scores and boxes",
+    )
+    return (*names, coco.NO_OBJECT) if more else names
+
+
 def split(
     outputs: Sequence[Tensor], layout: Layout, count: int, activation: Activation = "none"
 ) -> tuple[Tensor, Tensor, Tensor]:

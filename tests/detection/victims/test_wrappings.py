@@ -292,6 +292,22 @@ def test_a_module_of_the_session_is_read_alike(wrap: Callable[[Tensor, Tensor], 
     assert victim.answers == "gradients"
 
 
+def test_a_softmax_over_named_classes_may_have_one_more_for_no_object() -> None:
+    """As a DETR has that was trained on classes of one's own."""
+
+    def wrap(boxes: Tensor, scores: Tensor) -> dict[str, Tensor]:
+        shares = torch.cat((scores / 2, 1 - scores.sum(-1, keepdim=True) / 2), -1)
+        return {"logits": shares.clamp_min(1e-9).log(), "pred_boxes": centred(boxes) / SIZES}
+
+    reading: dict[str, Any] = {"activation": "softmax", "normalised": True, "boxes": "centre"}
+    victim = detector_of(Anywhere(Wrapped(wrap)), names=NAMES, **reading)
+    found = victim.load(0, StopSignApproach().facts)
+    sure = found(picture()).scores_of(SIGN).amax(-1)
+    torch.testing.assert_close(sure, RedCells()(picture())[1][..., SIGN].amax(-1) / 2)
+    with pytest.raises(UserError, match=r"with 2 classes \(victim.names\) it must return"):
+        detector_of(Anywhere(Wrapped(wrap)), names=NAMES, **(reading | {"activation": "sigmoid"}))
+
+
 def test_wrong_settings_of_a_module_are_told_before_a_run() -> None:
     class Bytes(Anywhere):
         def forward(self, pictures: Tensor) -> Any:
