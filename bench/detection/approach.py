@@ -95,8 +95,8 @@ class Unpatched:
         with torch.no_grad():
             # Where a plate appears, it is what stands in the sign's place.
             decoys = [None if one.mount.appears else look_at_decoys(detector, one) for one in scenes]
-            # Without an attack, or with light or a plate, there is no patch that something is certain under.
-            covered = [share and one.mount.shape in ("square", "stickers") for one in scenes]
+            # Without an attack, or with light or a plate, no patch hides a part of the sign.
+            covered = [share and one.mount.covers for one in scenes]
             least = [certain(detector, one, share) if some else None for one, some in zip(scenes, covered, strict=True)]
             # Last, so that a random detector draws the same as before for the others.
             faces = [None if one.mount.appears else look_at_faces(detector, one) for one in scenes]

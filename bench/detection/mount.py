@@ -12,9 +12,11 @@ from torch import Tensor
 from cavbench.detection.colour import linear
 
 Shape = Literal["square", "stickers", "light", "plate"]
-Place = Literal["middle", "top", "bottom"]
+Place = Literal["middle", "top", "bottom", "beside"]
 ASIDE = 0.25
 """Distance of the places `top` and `bottom` from the middle, as a share of the sign's side."""
+GAP = 0.05
+"""Between the sign and a plate beside it, as a share of the sign's side."""
 Spot = tuple[float, float, float, float]
 """x0, y0, x1, y1 on the bounding square of the sign: (0, 0) is its top left corner, (1, 1) the bottom right one."""
 
@@ -28,7 +30,8 @@ class Mount:
             in the middle of a quarter of the sign, so that they cover as much as the one square (Eykholt et al. 2018). `light`: a
             projector adds at most b times the light that falls on the sign (Lovisotto et al. 2021). `plate`: a plate of side b on
             a post without a sign.
-        place: of a square: in the middle of the sign, or a quarter of its side above or below, less where it would not fit.
+        place: of a square: in the middle of the sign, or a quarter of its side above or below, less where it would not fit; or
+            `beside`: on a plate of its own left of the sign, at the same height, which covers nothing of the sign.
     """
 
     shape: Shape = "square"
@@ -39,8 +42,13 @@ class Mount:
         """Whether there is no sign below the patch."""
         return self.shape == "plate"
 
+    @property
+    def covers(self) -> bool:
+        """Whether the patch hides a part of the sign."""
+        return self.shape in ("square", "stickers") and self.place != "beside"
+
     def spots(self, share: float) -> tuple[Spot, ...]:
-        """What the patch covers of the bounding square of the sign; what is beyond the octagon is cut off.
+        """Where the patch is; on the bounding square of the sign what is beyond the octagon is cut off.
 
         Args:
             share: the budget.
@@ -49,6 +57,8 @@ class Mount:
             return ((0.0, 0.0, 1.0, 1.0),)
         if self.shape == "stickers":
             return tuple(_square(x, y, share / 2) for y in (0.25, 0.75) for x in (0.25, 0.75))
+        if self.place == "beside":
+            return (_square(-GAP - share / 2, 0.5, share),)
         aside = min(ASIDE, (1 - share) / 2)
         return (_square(0.5, {"top": 0.5 - aside, "middle": 0.5, "bottom": 0.5 + aside}[self.place], share),)
 

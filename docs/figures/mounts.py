@@ -14,11 +14,12 @@ SHOWN = {
     "middle": Mount(),
     "top": Mount(place="top"),
     "bottom": Mount(place="bottom"),
+    "beside": Mount(place="beside"),
     "stickers": Mount("stickers"),
     "light": Mount("light"),
     "plate": Mount("plate"),
 }
-BUDGET, SIDE = 0.5, 132
+BUDGET, SIDE = 0.5, 160
 
 
 def mounts() -> Figure:
@@ -30,7 +31,8 @@ def mounts() -> Figure:
     (approach,) = world.approaches(cell, range(1))
     frame = torch.tensor([len(approach.scenes) - 1])
     middle = (approach.scenes.boxes[frame, :2] + approach.scenes.boxes[frame, 2:]) / 2
-    corner = (middle - SIDE / 2).round().long().clamp(min=0)
+    # There is more to see left of the sign.
+    corner = (middle - SIDE * torch.tensor([0.6, 0.5])).round().long().clamp(min=0)
     for axes, (name, mount) in zip(made.subplots(1, len(SHOWN)), SHOWN.items(), strict=True):
         show(axes, approach.scenes.mounted(mount).windows(frame, texels, BUDGET, corner, (SIDE, SIDE))[0])
         axes.set_title(name, fontsize=9)

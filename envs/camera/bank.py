@@ -206,7 +206,8 @@ class BankScenes(Scenes):
             return self._plates_alone(frames, patches, share, corners, size)
         numbers = frames.tolist()
         faces: dict[tuple[int, sign.Colour], tuple[Tensor, ...]] = {}
-        if patches is not None:
+        beside = patches is not None and self.mount.place == "beside"
+        if patches is not None and not beside:
             kinds = {_kind(self._plate(number)) for number in numbers}
             painted = {printed: sign.painted(patches, share, printed, self.mount) for _, printed in kinds}
             faces = {(side, printed): filtered(painted[printed], side).unbind() for side, printed in kinds}
@@ -215,7 +216,11 @@ class BankScenes(Scenes):
             plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
             picture = plate.cut(window)
             patched = common(window, plate.crop, _reach(self.poses[number], share, self.mount))
-            if patches is not None and patched:
+            if beside:
+                assert patches is not None
+                (spot,) = self.mount.spots(share)
+                picture = plate.beside(picture, window, patches[place % len(patches)], spot)
+            elif patches is not None and patched:
                 picture[within(patched, window)] = plate.signed(faces[_kind(plate)][place % len(patches)], patched)
             shown.append(picture)
         return shown

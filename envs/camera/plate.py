@@ -11,6 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.detection.colour import linear
+from cavbench.detection.mount import Spot
 from cavbench.envs.camera import develop, sign
 from cavbench.envs.camera.bare import Post, post_of, without_sign
 from cavbench.envs.camera.camera import Array, Camera
@@ -91,6 +93,48 @@ class Plate:
         filled = without_sign(self.picture.permute(1, 2, 0).numpy(), self.crop, self.lit.numpy(), self.post)
         return develop.light_of(torch.from_numpy(filled).permute(2, 0, 1) / 255)
 
+    def beside(self, picture: Tensor, window: Box, patch: Tensor, spot: Spot) -> Tensor:
+        """A window of the image with a patch on a plate of its own, in the plane of the sign; differentiable in the patch.
+
+        What the frame does not hold is taken from the sign: the plate is lit and dimmed as the sign is on the whole, and nothing
+        stands before it.
+
+        Args:
+            picture: float32 [3, h, w] without the plate.
+            window: its box in the image.
+            patch: sRGB in [0, 1], [3, P, P].
+            spot: where the plate is in texture coordinates of the sign.
+        """
+        if not self.lit.any():
+            return picture
+        place, inside = on_square(window, self.face_from_pixel, spot)
+        rows, columns = (np.flatnonzero(inside.any(axes)) for axes in ((1, 2, 3), (0, 1, 3)))
+        if not len(rows):
+            return picture
+        down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        samples = [slice(part.start * SUPERSAMPLING, part.stop * SUPERSAMPLING) for part in (down, across)]
+        inside = inside[down, :, across]
+        side = max(1, round((spot[2] - spot[0]) * detail(self.crop)))
+        # As many texels as the face of the sign would have there: fewer are means, more are copies.
+        mode = "area" if side < patch.shape[-1] else "nearest-exact"
+        texels = torch.nn.functional.interpolate(linear(patch)[None], size=(side, side), mode=mode)
+        found = torch.nn.functional.grid_sample(
+            texels,
+            torch.from_numpy(2 * place[samples[0], samples[1]] - 1)[None],
+            mode="bilinear",
+            padding_mode="border",
+            align_corners=False,
+        )
+        weight = torch.from_numpy(inside.reshape(found.shape[-2:]).astype(np.float32))
+        seen = torch.nn.functional.avg_pool2d(found * weight, SUPERSAMPLING)[0]
+        cover = torch.nn.functional.avg_pool2d(weight[None], SUPERSAMPLING)
+        black, gain = (part[:, self.lit].median(1).values[:, None, None] for part in (self.black, self.gain))
+        behind = develop.light_of(picture[:, down, across])
+        printed = torch.tensor(self.printed).view(3, 1, 1)
+        shown = picture.clone()
+        shown[:, down, across] = develop.tone(cover * black + gain * printed * seen + (1 - cover) * behind)
+        return shown
+
     def cut(self, part: Box) -> Tensor:
         """A part of the image with the plain sign, float32 [3, h, w]."""
         picture = self.picture[within(part, (0, 0, 0, 0))] / 255
@@ -145,6 +189,13 @@ def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
     return torch.nn.functional.avg_pool2d(found * torch.from_numpy(weight), SUPERSAMPLING)[0]
 
 
+def on_square(part: Box, face_from_pixel: Array, spot: Spot) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Where the samples of pixels are on a square beside or on the sign [h * S, w * S, 2], and whether inside [h, S, w, S]."""
+    place = (_sampled(part, face_from_pixel) - np.float32(spot[:2])) / (np.float32(spot[2:]) - np.float32(spot[:2]))
+    inside = ((place >= 0) & (place <= 1)).all(-1)
+    return place, inside.reshape(part[3] - part[1], SUPERSAMPLING, part[2] - part[0], SUPERSAMPLING)
+
+
 def wholly_sign(part: Box, face_from_pixel: Array) -> Tensor:
     """Which pixels show nothing but the sign, bool [h, w]."""
     return torch.from_numpy(_inside(part, face_from_pixel)[1].all((1, 3)))
@@ -152,12 +203,17 @@ def wholly_sign(part: Box, face_from_pixel: Array) -> Tensor:
 
 def _inside(part: Box, face_from_pixel: Array) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where the samples of the pixels are on the face [h * S, w * S, 2], and whether on the octagon [h, S, w, S]."""
+    place = _sampled(part, face_from_pixel)
+    return place, sign.inside(place).reshape(part[3] - part[1], SUPERSAMPLING, part[2] - part[0], SUPERSAMPLING)
+
+
+def _sampled(part: Box, face_from_pixel: Array) -> NDArray[np.float32]:
+    """Where the samples of the pixels are on the face [h * S, w * S, 2]."""
     x0, y0, x1, y1 = part
     step = 1 / SUPERSAMPLING
     u, v = (np.arange(low + step / 2, high, step, dtype=np.float32) for low, high in ((x0, x1), (y0, y1)))
     across, down, scale = (a * u + (b * v + c)[:, None] for a, b, c in face_from_pixel.tolist())
-    place = np.stack((across / scale, down / scale), -1)
-    return place, sign.inside(place).reshape(y1 - y0, SUPERSAMPLING, x1 - x0, SUPERSAMPLING)
+    return np.stack((across / scale, down / scale), -1)
 
 
 def detail(crop: Box) -> int:
