@@ -100,12 +100,15 @@ class QLearning:
         fused.assign(torch.from_numpy(self.target))
 
 
-class Values(nn.Module):
-    """Q(s, .) of a network in training, for TorchRL's actor."""
+class Greedy(nn.Module):
+    """Writes the `action` with the largest value of those that are allowed, for observations [N, V, F] in a tensordict."""
 
-    def __init__(self, learning: QLearning) -> None:
+    def __init__(self, learning: QLearning, mask: str | None) -> None:
         super().__init__()
-        self.learning = learning
+        self.learning, self.mask = learning, mask
 
-    def forward(self, observation: Tensor) -> Tensor:
-        return self.learning.scores(observation)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        values = self.learning.scores(tensordict["observation"])
+        if self.mask is not None:
+            values = values.masked_fill(~tensordict[self.mask], -torch.inf)
+        return tensordict.set("action", values.argmax(-1))

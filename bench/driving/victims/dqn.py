@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
@@ -16,7 +15,7 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
 from cavbench.core.ranges import Share
 from cavbench.driving import ActionType, Policy, TrainingHooks
-from cavbench.driving.fused.q_learning import QLearning, Transitions, Values
+from cavbench.driving.fused.q_learning import Greedy, QLearning, Transitions
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import ALLOWED
@@ -72,7 +71,7 @@ class _QLearner(OffPolicyLearner):
             action_mask_key=self.mask,
         )
         self.rule: _Compiled | _Torch = (_Torch if hooks.learns_otherwise else _Compiled)(self)
-        self.explore = TensorDictSequential(self.rule.actor, self.greedy)
+        self.explore = nn.Sequential(self.rule.actor, self.greedy)
 
     def enter(self, phase: Phase) -> None:
         super().enter(phase)
@@ -97,23 +96,13 @@ class _QLearner(OffPolicyLearner):
         self.rule.average(self.mean)
         return self.mean
 
-    def actor(self, network: nn.Module) -> QValueActor:
-        """The greedy actions of a network."""
-        return QValueActor(
-            network,
-            in_keys=["observation"],
-            spec=Categorical(self.policy.shape["actions"]),
-            action_space="categorical",
-            action_mask_key=self.mask,
-        )
-
 
 class _Compiled:
     """The same algorithm as `_Torch` in compiled calls (`cavbench.driving.fused`), equal to rounding."""
 
     def __init__(self, learner: _QLearner) -> None:
         self.learning = QLearning(learner.policy.network.fused, tau=learner.recipe.tau, longest=LONGEST)
-        self.actor, self.mask = learner.actor(Values(self.learning)), learner.mask
+        self.actor, self.mask = Greedy(self.learning, learner.mask), learner.mask
 
     def enter(self, phase: Phase) -> None:
         self.gamma, self.gap = phase.gamma, phase.gap
@@ -135,8 +124,8 @@ class _Torch:
     """TorchRL's loss, torch's Adam."""
 
     def __init__(self, learner: _QLearner) -> None:
-        self.learner, self.policy, self.hooks, self.mask = learner, learner.policy, learner.hooks, learner.mask
-        self.actor, self.gap = learner.actor(learner.policy.network), 0.0
+        self.policy, self.hooks, self.mask = learner.policy, learner.hooks, learner.mask
+        self.actor = self._actor(self.policy)
         self.loss = DQNLoss(self.actor, loss_function="smooth_l1", double_dqn=True, delay_value=True, reduction="none")
         self.target = SoftUpdate(self.loss, tau=learner.recipe.tau)
         self.adam = torch.optim.Adam(self.policy.parameters(), learner.recipe.learning_rate)
@@ -156,7 +145,7 @@ class _Torch:
         self.target.step()
 
     def average(self, policy: QPolicy) -> None:
-        copy_weights(self.loss.target_value_network_params, self.learner.actor(policy.network))
+        copy_weights(self.loss.target_value_network_params, self._actor(policy))
 
     def _temporal_difference(self, sample: TensorDictBase) -> Tensor:
         loss: Tensor = self.loss(sample)["loss"]
@@ -169,3 +158,12 @@ class _Torch:
         if self.mask is not None:
             values = values.masked_fill(~sample[self.mask], -torch.inf)
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
+
+    def _actor(self, policy: QPolicy) -> QValueActor:
+        return QValueActor(
+            policy.network,
+            in_keys=["observation"],
+            spec=Categorical(policy.shape["actions"]),
+            action_space="categorical",
+            action_mask_key=self.mask,
+        )
