@@ -69,7 +69,9 @@ def _speed(name: str, rounds: int, decisions: int) -> None:
             flush=True,
         )
     whole = minutes["torch"] / minutes["compiled"]
-    print(f"\n{name}: {minutes['torch']:.1f} CPU minutes with torch, {minutes['compiled']:.1f} compiled, {whole:.2f} x\n")
+    print(
+        f"\n{name}: {minutes['torch']:.1f} CPU minutes with torch, {minutes['compiled']:.1f} compiled, {whole:.2f} x\n"
+    )
 
 
 def _practice(victim: LearningDriver, number: int, torchs: bool) -> Practice:
@@ -102,7 +104,9 @@ def _round(practice: Practice, decisions: int) -> tuple[float, float]:
 
 def _curves(name: str, seeds: int) -> None:
     victim = choose("victim", name, **SHORT).component
-    print(f"| {name} | share of the training | mean over {seeds} seeds | standard deviation | of each seed |\n|---|---|---|---|---|")
+    print(
+        f"| {name} | share of the training | mean over {seeds} seeds | standard deviation | of each seed |\n|---|---|---|---|---|"
+    )
     for way, torchs in WAYS.items():
         curves = [_curve(victim, seed, torchs) for seed in range(seeds)]
         for scores in zip(*curves, strict=True):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from tensordict import TensorDictBase
@@ -52,7 +52,7 @@ class Transitions:
         return len(self.action)
 
     def __getitem__(self, rows: Tensor) -> Transitions:
-        return Transitions(*(None if value is None else value[rows] for value in vars(self).values()))
+        return replace(self, **{name: value[rows] for name, value in vars(self).items() if value is not None})
 
 
 class QLearning:

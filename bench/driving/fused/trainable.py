@@ -30,7 +30,7 @@ class Trainable:
         self._kept: Floats = np.empty((0, fused.kept, kernels.LANES), np.float32)
 
     def forward(self, observation: Tensor, *, weights: Floats | None = None) -> Tensor:
-        """The answers [N, A] about observations [N, V, F], with other weights if they are given; `backward` is about this call."""
+        """The answers [N, A] about observations [N, V, F], by default with its own weights; `backward` is about this call."""
         points = observation.reshape(len(observation), -1).contiguous().numpy()
         blocks = -(-len(points) // kernels.LANES)
         if len(self._kept) < blocks:

@@ -21,7 +21,6 @@ from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import ALLOWED
 from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
 
-
 LONGEST = 10.0
 """The norm to which gradients are clipped."""
 

@@ -134,7 +134,8 @@ def test_a_dqn_learns_what_it_learns_with_torch(phase: int, behind: str) -> None
         for own, other in zip(*(network.parameters() for network in networks), strict=True):
             torch.testing.assert_close(own, other, atol=1e-5, rtol=1e-4)
     begun, _, _ = learner(recipe, phase, compiled=True)
-    assert max(float((a - b).abs().max()) for a, b in zip(begun.policy.parameters(), compiled.policy.parameters(), strict=True)) > 1e-3
+    learned = zip(begun.policy.parameters(), compiled.policy.parameters(), strict=True)
+    assert max(float((before - after).abs().max()) for before, after in learned) > 1e-3
 
 
 def test_a_compiled_dqn_explores_among_the_allowed_actions() -> None:
