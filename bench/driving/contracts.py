@@ -237,6 +237,11 @@ class TrainingHooks:
         """
         return own(sample)
 
+    @property
+    def learns_otherwise(self) -> bool:
+        """Whether it changes what is learned from a transition. If not, the update may be compiled."""
+        return any(getattr(type(self), name) is not getattr(TrainingHooks, name) for name in ("replayed", "loss"))
+
     def selection(self, policy: Policy) -> dict[str, Callable[[Tensor, State], Tensor]]:
         """Additional perturbations of the observation for scoring a checkpoint, by name; arguments: observation and state."""
         return {}

@@ -42,7 +42,7 @@ class Form(NamedTuple):
 
 
 @rounded_once
-def _add(
+def add(
     x: Floats, weights: Floats, at: int, by_output: int, by_input: int, inputs: int, outputs: int, y: Floats, lanes: int
 ) -> None:
     """y [outputs, lanes] += w @ x, for x [inputs, lanes] and the weight of (j, k) at `at + j * by_output + k * by_input`.
@@ -82,7 +82,7 @@ def _add(
 
 
 @rounded_once
-def _fill(y: Floats, weights: Floats, at: int, lanes: int) -> None:
+def fill(y: Floats, weights: Floats, at: int, lanes: int) -> None:
     """The biases as the beginning of each sum."""
     for j in range(len(y)):
         for n in range(lanes):
@@ -122,7 +122,7 @@ def _activate(y: Floats, kind: int, lanes: int) -> None:
 
 
 @rounded_once
-def _read(points: Floats, start: int, count: int, first: int, lanes: int, x: Floats) -> None:
+def read(points: Floats, start: int, count: int, first: int, lanes: int, x: Floats) -> None:
     """The values from `first` on of the points of a block, a row for each; places without a point are 0."""
     for k in range(len(x)):
         for n in range(count):
@@ -156,14 +156,14 @@ def _encode(
     pair = ego + width * (size - 1)
     x, own, hidden = work[:size], work[size : size + width], work[size + width : size + 2 * width]
     response = work[size + 2 * width : size + 2 * width + pooled]
-    _read(points, start, count, 1, lanes, layer[: size - 1])
-    _fill(own, weights, car + width * size, lanes)
-    _add(layer[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
+    read(points, start, count, 1, lanes, layer[: size - 1])
+    fill(own, weights, car + width * size, lanes)
+    add(layer[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
     for p in range(pooled):
         for n in range(lanes):
             best[p, n], chosen[p, n] = np.float32(0), np.float32(NOBODY)
     for row in range(1, form.rows):
-        _read(points, start, count, row * size, lanes, x)
+        read(points, start, count, row * size, lanes, x)
         absent = True
         for n in range(count):
             absent &= x[0, n] == 0
@@ -173,10 +173,10 @@ def _encode(
         for j in range(width):
             for n in range(lanes):
                 hidden[j, n] = own[j, n]
-        _add(x, weights, car, size, 1, size, width, hidden, lanes)
+        add(x, weights, car, size, 1, size, width, hidden, lanes)
         _activate(hidden, RELU, lanes)
-        _fill(response, weights, pair + pooled * width, lanes)
-        _add(hidden, weights, pair, width, 1, width, pooled, response, lanes)
+        fill(response, weights, pair + pooled * width, lanes)
+        add(hidden, weights, pair, width, 1, width, pooled, response, lanes)
         number = np.float32(row)
         for p in range(pooled):
             for n in range(lanes):
@@ -226,13 +226,13 @@ def forward(
         if form.width:
             _encode(points, start, count, weights, form, lanes, layers[: widths[0]], best[place], chosen[place], work)
         else:
-            _read(points, start, count, 0, lanes, layers[: widths[0]])
+            read(points, start, count, 0, lanes, layers[: widths[0]])
         at, row = head, 0
         for number in range(len(kinds)):
             inputs, outputs = widths[number], widths[number + 1]
             y = layers[row + inputs : row + inputs + outputs]
-            _fill(y, weights, at + outputs * inputs, lanes)
-            _add(layers[row : row + inputs], weights, at, inputs, 1, inputs, outputs, y, lanes)
+            fill(y, weights, at + outputs * inputs, lanes)
+            add(layers[row : row + inputs], weights, at, inputs, 1, inputs, outputs, y, lanes)
             _activate(y, kinds[number], lanes)
             at, row = at + outputs * (inputs + 1), row + inputs
         _answer(layers[row : row + widths[-1]], weights, at, form.last, start, count, out)
@@ -285,14 +285,14 @@ def backward(
         start = block * LANES
         count = min(LANES, len(points) - start)
         lanes, layers = (count + GRAIN - 1) // GRAIN * GRAIN, kept[block]
-        _answer_backward(by_out, weights, total, form.last, start, count, lanes, one[: widths[-1]])
+        answer_backward(by_out, weights, total, form.last, start, count, lanes, one[: widths[-1]])
         at, row = total, len(layers) - widths[-1]
         for number in range(len(kinds) - 1, -1, -1):
             inputs, outputs = widths[number], widths[number + 1]
             at -= outputs * (inputs + 1)
-            _activate_backward(layers[row : row + outputs], kinds[number], lanes, one)
+            activate_backward(layers[row : row + outputs], kinds[number], lanes, one)
             two[:inputs] = 0
-            _add(one[:outputs], weights, at, 1, inputs, outputs, inputs, two[:inputs], lanes)
+            add(one[:outputs], weights, at, 1, inputs, outputs, inputs, two[:inputs], lanes)
             one, two = two, one
             row -= inputs
         if form.width:
@@ -306,7 +306,7 @@ def backward(
 
 
 @rounded_once
-def _answer_backward(
+def answer_backward(
     by_out: Floats, weights: Floats, at: int, last: int, start: int, count: int, lanes: int, by_y: Floats
 ) -> None:
     for j in range(len(by_y)):
@@ -326,7 +326,7 @@ def _answer_backward(
 
 
 @rounded_once
-def _activate_backward(y: Floats, kind: int, lanes: int, by_y: Floats) -> None:
+def activate_backward(y: Floats, kind: int, lanes: int, by_y: Floats) -> None:
     """The gradient before an activation from that after it, in place, and its results `y`."""
     if kind == RELU:
         for j in range(len(y)):
@@ -368,12 +368,12 @@ def _encode_backward(
     by_hidden, at = work[at : at + width], at + width
     by_own, at = work[at : at + width], at + width
     by_response = work[at : at + pooled]
-    _read(points, start, count, 1, lanes, x[: size - 1])
-    _fill(own, weights, width * size, lanes)
-    _add(x[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
+    read(points, start, count, 1, lanes, x[: size - 1])
+    fill(own, weights, width * size, lanes)
+    add(x[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
     by_own[:] = 0
     for row in range(1, form.rows):
-        _read(points, start, count, row * size, lanes, x)
+        read(points, start, count, row * size, lanes, x)
         number, asked = np.float32(row), False
         by_x[:] = 0
         for p in range(pooled):
@@ -394,15 +394,15 @@ def _encode_backward(
         for j in range(width):
             for n in range(lanes):
                 hidden[j, n], by_hidden[j, n] = own[j, n], np.float32(0)
-        _add(x, weights, 0, size, 1, size, width, hidden, lanes)
-        _add(by_response, weights, pair, 1, width, pooled, width, by_hidden, lanes)
+        add(x, weights, 0, size, 1, size, width, hidden, lanes)
+        add(by_response, weights, pair, 1, width, pooled, width, by_hidden, lanes)
         for j in range(width):
             for n in range(lanes):
                 slope, before = by_hidden[j, n], hidden[j, n]
                 slope = slope if before > 0 else np.float32(0)
                 by_hidden[j, n] = slope
                 by_own[j, n] += slope
-        _add(by_hidden, weights, 0, 1, size, width, size, by_x, lanes)
+        add(by_hidden, weights, 0, 1, size, width, size, by_x, lanes)
         for n in range(count):
             for k in range(size):
                 by_points[start + n, row * size + k] = by_x[k, n]
@@ -410,7 +410,7 @@ def _encode_backward(
     for k in range(size - 1):
         for n in range(lanes):
             by_ego[k, n] = by_layer[k, n]
-    _add(by_own, weights, ego, 1, size - 1, width, size - 1, by_ego, lanes)
+    add(by_own, weights, ego, 1, size - 1, width, size - 1, by_ego, lanes)
     for n in range(count):
         by_points[start + n, 0] = np.float32(0)
         for k in range(size - 1):

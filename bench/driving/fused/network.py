@@ -102,6 +102,23 @@ class Fused:
         kernels.forward(*given, out, kept, best, chosen)
         return torch.from_numpy(out).view(*leading, self.outputs), (*given, kept, best, chosen)
 
+    def gathered(self) -> Tensor:
+        """All weights in one vector, in the order of `kernels.forward`; the parameters become views of it."""
+        flat = torch.cat([weight.detach().reshape(-1) for weight in self._weights()])
+        for weight, part in self._parts(flat):
+            weight.data = part
+        return flat
+
+    def assign(self, flat: Tensor) -> None:
+        """Copy weights in one vector, as from `gathered`, into the parameters."""
+        for weight, part in self._parts(flat):
+            weight.data.copy_(part)
+
+    def _parts(self, flat: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        weights = self._weights()
+        for weight, part in zip(weights, flat.split([weight.numel() for weight in weights]), strict=True):
+            yield weight, part.view_as(weight)
+
     def form(self, size: int) -> kernels.Form:
         """The network for points of `size` values."""
         rows = size // self.features if self.features else 1

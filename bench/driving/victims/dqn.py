@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictSequential
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 from torchrl.modules import EGreedyModule, QValueActor
@@ -16,10 +15,14 @@ from torchrl.objectives import DQNLoss, SoftUpdate, ValueEstimators
 
 from cavbench.core.ranges import Share
 from cavbench.driving import ActionType, Policy, TrainingHooks
+from cavbench.driving.fused.q_learning import Greedy, QLearning, Transitions
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import ALLOWED
 from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
+
+LONGEST = 10.0
+"""The norm to which gradients are clipped."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,9 +50,11 @@ class DQN(OffPolicyDriver):
 
 
 class _QLearner(OffPolicyLearner):
+    """Drives, and remembers; how it learns is `_Compiled`, or `_Torch` if the hooks change what is learned."""
+
     def __init__(self, recipe: DQN, env: EnvBase, hooks: TrainingHooks) -> None:
         super().__init__(hooks, memory=recipe.memory, batch=recipe.batch, updates=recipe.updates)
-        self.recipe, self.gap = recipe, 0.0
+        self.recipe = recipe
         batch, _, features = env.observation_spec["observation"].shape
         actions = int(env.action_spec.space.n)
         self.policy: QPolicy = QPolicy(features, actions, recipe.hidden)
@@ -57,7 +62,6 @@ class _QLearner(OffPolicyLearner):
         if hooks.start is not None:
             self.policy.load_state_dict(hooks.start.state_dict())
         self.mask = ALLOWED if recipe.behind else None
-        actor = self._actor(self.policy)
         self.greedy = EGreedyModule(
             Categorical(actions, shape=(batch,)),
             eps_init=1.0 if hooks.start is None else recipe.final_epsilon,
@@ -65,28 +69,82 @@ class _QLearner(OffPolicyLearner):
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
             action_mask_key=self.mask,
         )
-        self.explore = TensorDictSequential(actor, self.greedy)
-        self.loss = DQNLoss(actor, loss_function="smooth_l1", double_dqn=True, delay_value=True, reduction="none")
-        self.target = SoftUpdate(self.loss, tau=recipe.tau)
-        self.adam = torch.optim.Adam(self.policy.parameters(), recipe.learning_rate)
+        self.rule: _Compiled | _Torch = (_Torch if hooks.learns_otherwise else _Compiled)(self)
+        self.explore = nn.Sequential(self.rule.actor, self.greedy)
 
     def enter(self, phase: Phase) -> None:
         super().enter(phase)
-        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
-        self.gap = phase.gap
+        self.rule.enter(phase)
         if phase.exploration < 1:
             self.greedy.eps_end.fill_(self.recipe.final_epsilon * phase.exploration)
             self.greedy.eps.fill_(self.recipe.final_epsilon * phase.exploration)
 
+    def learn(self, learning_rate: float, share: float) -> None:
+        if isinstance(self.rule, _Compiled):
+            self.rule.learn(self.buffer[:], self.batch, CHUNK * self.updates, learning_rate)
+        else:
+            super().learn(learning_rate, share)
+
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
+        self.rule.update(sample, learning_rate)
+
+    def anneal(self) -> None:
+        self.greedy.step()
+
+    def averaged(self) -> Policy:
+        self.rule.average(self.mean)
+        return self.mean
+
+
+class _Compiled:
+    """The same algorithm as `_Torch` in compiled calls (`cavbench.driving.fused`), equal to rounding."""
+
+    def __init__(self, learner: _QLearner) -> None:
+        self.learning = QLearning(learner.policy.network.fused, tau=learner.recipe.tau, longest=LONGEST)
+        self.actor, self.mask = Greedy(self.learning, learner.mask), learner.mask
+
+    def enter(self, phase: Phase) -> None:
+        self.gamma, self.gap = phase.gamma, phase.gap
+
+    def learn(self, stored: TensorDictBase, batch: int, updates: int, rate: float) -> None:
+        """Make several updates on random batches of what is `stored`."""
+        transitions = Transitions.of(stored, self.gamma, self.mask)
+        for rows in torch.randint(len(transitions), (updates, batch)):
+            self.learning.update(transitions[rows], gap=self.gap, rate=rate)
+
+    def update(self, sample: TensorDictBase, rate: float) -> None:
+        self.learning.update(Transitions.of(sample, self.gamma, self.mask), gap=self.gap, rate=rate)
+
+    def average(self, policy: QPolicy) -> None:
+        self.learning.averaged(policy.network.fused)
+
+
+class _Torch:
+    """TorchRL's loss, torch's Adam."""
+
+    def __init__(self, learner: _QLearner) -> None:
+        self.policy, self.hooks, self.mask = learner.policy, learner.hooks, learner.mask
+        self.actor = self._actor(self.policy)
+        self.loss = DQNLoss(self.actor, loss_function="smooth_l1", double_dqn=True, delay_value=True, reduction="none")
+        self.target = SoftUpdate(self.loss, tau=learner.recipe.tau)
+        self.adam = torch.optim.Adam(self.policy.parameters(), learner.recipe.learning_rate)
+
+    def enter(self, phase: Phase) -> None:
+        self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
+        self.gap = phase.gap
+
+    def update(self, sample: TensorDictBase, rate: float) -> None:
         if self.gap > 0:
             sample["next", "reward"] -= self.gap * self._disadvantage(sample)
-        self.adam.param_groups[0]["lr"] = learning_rate
+        self.adam.param_groups[0]["lr"] = rate
         self.adam.zero_grad()
         self.hooks.loss(self.policy, sample, self._temporal_difference).mean().backward()
-        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), 10.0)
+        torch.nn.utils.clip_grad_norm_(self.policy.parameters(), LONGEST)
         self.adam.step()
         self.target.step()
+
+    def average(self, policy: QPolicy) -> None:
+        copy_weights(self.loss.target_value_network_params, self._actor(policy))
 
     def _temporal_difference(self, sample: TensorDictBase) -> Tensor:
         loss: Tensor = self.loss(sample)["loss"]
@@ -99,13 +157,6 @@ class _QLearner(OffPolicyLearner):
         if self.mask is not None:
             values = values.masked_fill(~sample[self.mask], -torch.inf)
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
-
-    def anneal(self) -> None:
-        self.greedy.step()
-
-    def averaged(self) -> Policy:
-        copy_weights(self.loss.target_value_network_params, self._actor(self.mean))
-        return self.mean
 
     def _actor(self, policy: QPolicy) -> QValueActor:
         return QValueActor(
