@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
+from cavbench.core.registry import Kind
 from cavbench.leaderboard.comparisons.comparison import parameters
 from cavbench.leaderboard.comparisons.typed import typed
 from cavbench.leaderboard.ranking.boards import Board, Row
@@ -21,7 +21,7 @@ class Method:
     """A defended victim, wherever it drives.
 
     Args:
-        defense, victim: names with the parameters that are no defaults.
+        defense, victim: names, with the parameters that tell it from others of its name.
         home: where it was trained: the name of a world, or `EACH`; empty for one that does not say.
         mine: whether it is of a user's own records, beside published ones.
     """
@@ -37,9 +37,15 @@ class Method:
         return f"trained in {self.home}" if self.home else ""
 
 
+Part = tuple[str, tuple[tuple[str, str], ...]]
+"""The name of a component, and the parameters that are no defaults."""
+Key = tuple[Part, Part, str, bool]
+"""Defence, victim, home, and whether it is a user's own."""
+
+
 def world_name(board: Board) -> str:
     """The world of a leaderboard, with the parameters that are no defaults."""
-    return _written("world", *board.world)
+    return _written(_part("world", *board.world))
 
 
 def methods(boards: Mapping[str, Board]) -> dict[Method, dict[str, Row]]:
@@ -51,33 +57,33 @@ def methods(boards: Mapping[str, Board]) -> dict[Method, dict[str, Row]]:
     Args:
         boards: of one threat model, by the name of their world.
     """
-    found: dict[Method, dict[str, Row]] = {}
+    found: dict[Key, dict[str, Row]] = {}
     for world, board in boards.items():
         for row in board.rows:
-            for method in _methods(row, board):
+            for key in _keys(row, board):
                 # The first is the one that ranks higher, where records of several versions of a component make two.
-                found.setdefault(method, {}).setdefault(world, row)
-    kept: dict[Method, dict[str, Row]] = {}
+                found.setdefault(key, {}).setdefault(world, row)
+    kept: dict[Key, dict[str, Row]] = {}
     # Of equal ones the one with a name for its home.
-    for method in sorted(found, key=lambda one: (-len(found[one]), one.home == EACH, one)):
-        rows = found[method]
-        others = (other for key, other in kept.items() if _named(key) == _named(method))
+    for key in sorted(found, key=lambda one: (-len(found[one]), one[2] == EACH, one)):
+        rows = found[key]
+        others = (other for one, other in kept.items() if (one[:2], one[3]) == (key[:2], key[3]))
         if not any(rows.items() <= other.items() for other in others):
-            kept[method] = rows
-    return kept
+            kept[key] = rows
+    written = [_titles([key[place] for key in kept]) for place in (0, 1)]
+    return {Method(written[0][key[0]], written[1][key[1]], *key[2:]): rows for key, rows in kept.items()}
 
 
-def _methods(row: Row, board: Board) -> list[Method]:
+def _keys(row: Row, board: Board) -> list[Key]:
     identity = row.identity
-    victim = parameters(identity["victim_params"])
-    defense = _written("defense", str(identity["defense"]), str(identity["defense_params"]))
-    named = _written("victim", str(identity["victim"]), identity["victim_params"])
-    if HOME not in victim:
-        return [Method(defense, named, "", row.mine)]
-    default, here = board.track.world, world_name(board)
-    home = _home(str(victim[HOME]), default)
+    defense = _part("defense", str(identity["defense"]), identity["defense_params"])
+    victim = _part("victim", str(identity["victim"]), identity["victim_params"])
+    params = parameters(identity["victim_params"])
+    if HOME not in params:
+        return [(defense, victim, "", row.mine)]
+    here, home = world_name(board), _home(str(params[HOME]), board.track.world)
     homes = [home, EACH] if home == here else [home]
-    return [Method(defense, named, one, row.mine) for one in homes]
+    return [(defense, victim, one, row.mine) for one in homes]
 
 
 def _home(text: str, default: str) -> str:
@@ -86,19 +92,28 @@ def _home(text: str, default: str) -> str:
         return text or default
     words = text.split()
     name, values = (default, words) if "=" in words[0] else (words[0], words[1:])
-    return f"{name}({', '.join(values)})" if values else name
+    return _written((name, tuple(tuple(word.split("=", 1)) for word in values)))  # type: ignore[arg-type]
 
 
-def _named(one: Method) -> tuple[str, str, bool]:
-    return one.defense, one.victim, one.mine
-
-
-def _written(kind: Any, name: str, params: str) -> str:
+def _part(kind: Kind, name: str, params: object) -> Part:
     """A component with the parameters that are no defaults; a victim without its home."""
-    given = parameters(params)
-    values = {key: value for key, value in typed(kind, name, given).items() if key != HOME and value != ""}
-    words = [f"{key}={_plain(value)}" for key, value in sorted(values.items())]
-    return f"{name}({', '.join(words)})" if words else name
+    values = {key: value for key, value in typed(kind, name, parameters(params)).items() if key != HOME and value != ""}
+    return name, tuple((key, _plain(value)) for key, value in sorted(values.items()))
+
+
+def _titles(parts: Sequence[Part]) -> dict[Part, str]:
+    """Each component with the parameters in which those of its name differ."""
+    found = {}
+    for name, own in parts:
+        sets = [set(params) for other, params in parts if other == name]
+        common = set.intersection(*sets)
+        found[name, own] = _written((name, tuple(one for one in own if one not in common)))
+    return found
+
+
+def _written(part: Part) -> str:
+    name, params = part
+    return f"{name}({', '.join(f'{key}={value}' for key, value in params)})" if params else name
 
 
 def _plain(value: object) -> str:

@@ -127,7 +127,12 @@ def _board(boards: Mapping[str, Board]) -> WorldBoard:
     references = {name: _References.of(board) for name, board in boards.items()}
     without = {name: why for name in names if (why := references[name].missing(boards[name]))}
     counted = [name for name in names if name not in without]
-    rows = [_row(method, own, references, counted) for method, own in methods(boards).items()]
+    rows = [
+        _row(method, own, references, counted)
+        for method, own in methods(boards).items()
+        # Without a scale nothing is said of a row but its scores, and one score is on the leaderboard of its world.
+        if counted or len(own) > 1
+    ]
     grids = {name: board.grid for name, board in boards.items()}
     return WorldBoard(first.track, first.threat, grids, without, tuple(ranked(rows)))
 
