@@ -70,8 +70,8 @@ def methods(boards: Mapping[str, Board]) -> dict[Method, dict[str, Row]]:
         others = (other for one, other in kept.items() if (one[:2], one[3]) == (key[:2], key[3]))
         if not any(rows.items() <= other.items() for other in others):
             kept[key] = rows
-    written = [_titles([key[place] for key in kept]) for place in (0, 1)]
-    return {Method(written[0][key[0]], written[1][key[1]], *key[2:]): rows for key, rows in kept.items()}
+    defenses, victims = _titles([key[0] for key in kept]), _titles([key[1] for key in kept])
+    return {Method(defenses[key[0]], victims[key[1]], *key[2:]): rows for key, rows in kept.items()}
 
 
 def _keys(row: Row, board: Board) -> list[Key]:
@@ -92,7 +92,8 @@ def _home(text: str, default: str) -> str:
         return text or default
     words = text.split()
     name, values = (default, words) if "=" in words[0] else (words[0], words[1:])
-    return _written((name, tuple(tuple(word.split("=", 1)) for word in values)))  # type: ignore[arg-type]
+    pairs = [word.partition("=") for word in values]
+    return _written((name, tuple((key, value) for key, _, value in pairs)))
 
 
 def _part(kind: Kind, name: str, params: object) -> Part:
