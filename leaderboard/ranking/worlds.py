@@ -19,9 +19,6 @@ from cavbench.statistics.estimates import Array, Interval, interval
 from cavbench.statistics.independent import independent
 from cavbench.statistics.scaled import has_scale, mean_of, over_worlds, scaled
 
-UNASKED = "unattacked"
-"""The flag of a row that no attack asked: its score there is not one under attack."""
-
 
 @dataclass(frozen=True, eq=False)
 class InWorld:
@@ -223,10 +220,11 @@ def _row(
         places[name] = place
         if name not in counted:
             continue
-        if any(flag.name == UNASKED and flag.fired for flag in row.flags):
-            lacks[name] = "no attack asked the victim"
-        elif not common:
+        if not common:
             lacks[name] = "no attack was driven in all of its worlds"
+        elif all(one.queries == 0 for one in _some(row, common)):
+            # Its score there is not one under attack. NaN, which is no 0, where records do not count queries.
+            lacks[name] = f"no attack that it met in all of its worlds asked it anything ({', '.join(sorted(common))})"
         elif place.parts is None:
             lacks[name] = "its references were driven on other scenarios"
     found = WorldRow(method, places, lacks, tuple(sorted(common)))
@@ -248,7 +246,7 @@ def _of_runs(place: InWorld, runs: set[int]) -> Array:
 
 def _place(row: Row, common: set[str], references: _References | None) -> InWorld:
     """A row in a world under the attacks in `common`; without a share where the world has no scale."""
-    some = [one for one in (*row.attacks, *row.left_out) if str(one.identity["attack"]) in common]
+    some = _some(row, common)
     # All attacks of the row: its score is that of its leaderboard.
     whole = len(some) == len(row.attacks) + len(row.left_out) or not some
     worst = row.worst if whole else Panel.of(some).strongest() or row.worst
@@ -259,6 +257,11 @@ def _place(row: Row, common: set[str], references: _References | None) -> InWorl
     if not (high - low).mean() > 0:
         return InWorld(worst)
     return InWorld(worst, scaled(worst.scores, low, high), float(low.mean()), float(high.mean()))
+
+
+def _some(row: Row, names: set[str]) -> list[Comparison]:
+    """The attacks on a row with these names."""
+    return [one for one in (*row.attacks, *row.left_out) if str(one.identity["attack"]) in names]
 
 
 def ranked(rows: Sequence[WorldRow]) -> Iterator[WorldRow]:

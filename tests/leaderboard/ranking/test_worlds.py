@@ -64,13 +64,18 @@ def test_a_row_that_lacks_a_world_says_which_and_has_no_rank() -> None:
     assert lone.worst is None
 
 
-def test_an_attack_that_asks_nothing_makes_no_score_under_attack() -> None:
-    board = worlds(
-        attacked("dqn", "merge", 0.5), attacked("dqn", "exit", 0.5, "noise"), references("merge"), references("exit")
-    )
-    (row,) = board.rows
+def test_attacks_that_ask_nothing_make_no_score_under_attack() -> None:
+    ends = [references(name) for name in ("merge", "exit")]
+    noise = [attacked("dqn", name, 0.5, "noise") for name in ("merge", "exit")]
+    (row,) = worlds(*noise, *ends).rows
     assert row.group == 0
-    assert row.lacks["exit"] == "no attack asked the victim"
+    assert set(row.lacks.values()) == {"no attack that it met in all of its worlds asked it anything (noise)"}
+    # Another attack in each world: the row met none of them in both.
+    asked = [[scores("dqn", name, 0.4, attack=one, queries=9.0)] for name, one in (("merge", "pgd"), ("exit", "zo"))]
+    (row,) = worlds(*noise, *asked, *ends).rows
+    assert row.group == 0
+    (row,) = worlds(*asked, *([scores("dqn", name, 0.7)] for name in ("merge", "exit")), *ends).rows
+    assert set(row.lacks.values()) == {"no attack was driven in all of its worlds"}
 
 
 def test_only_attacks_that_a_row_met_in_all_of_its_worlds_count() -> None:
