@@ -3,11 +3,13 @@
     python -m cavbench.leaderboard.published RESULTS          # publishes the newest records of a results folder, row by row
     python -m cavbench.leaderboard.published RESULTS --add    # adds them to those that a row has
     python -m cavbench.leaderboard.published RESULTS --faults # adds what `attack=faults` did to rows
+    python -m cavbench.leaderboard.published RESULTS --worlds # adds what `attack=worlds` did in several worlds
     python -m cavbench.leaderboard.published                  # writes the faces of all rows again
 
 A row is a defended victim on a grid. Its records are `data/GRID/NAME.parquet`, its face is `rows/GRID/NAME.json`
 (`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid,
 which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`. So are those of faults, `data/faults-1/faults.parquet`.
+Records of the suite `worlds` are read by the leaderboard over worlds alone: `data/worlds-1/NAME.parquet`, a file for all worlds.
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -45,6 +47,8 @@ BASELINES = "baselines"
 """The file of a grid with the victims that others are compared with."""
 FAULTS = "faults"
 """The file with the records of a suite of faults, which ranks nothing, of all rows with their controls and baselines."""
+WORLDS = "worlds"
+"""The family of suites whose records are compared over worlds, and rank nothing within one."""
 SERIES = ("pair", "training_seed", "grid")
 """The columns that records are renewed by."""
 MEASURED = frozenset({"return", "distance_m", "min_ttc_s", "mean_speed", "linf", "l2", "linf_m", "linf_mps"})
@@ -59,14 +63,37 @@ SINGLE = ("linf", "l2", "linf_m", "linf_mps", "mean_speed")
 def published(of: Track) -> pa.Table:
     """Every record of a track in `leaderboard/data`, an empty table if none is shipped."""
     with as_file(files(HOME) / "data") as folder:
-        paths = [path for path in sorted(folder.glob("*/*.parquet")) if track_of(path).name == of.name]
-        tables = [reading.read_file(path) for path in paths]
+        return _read(of, [path for path in sorted(folder.glob("*/*.parquet")) if not _is_of_worlds(path)])
+
+
+def _read(of: Track, paths: Sequence[Path]) -> pa.Table:
+    """The records of a track in some files."""
+    tables = [reading.read_file(path) for path in paths if track_of(path).name == of.name]
     return together([encoded(of).empty_table(), *tables])
 
 
-def every_track() -> dict[str, pa.Table]:
-    """The published records of every track that has some."""
-    found = {one.name: published(one) for one in tracks()}
+def _is_of_worlds(path: Path) -> bool:
+    return path.parent.name.rpartition("-")[0] == WORLDS
+
+
+def every_track(*, worlds: bool = False) -> dict[str, pa.Table]:
+    """The published records of every track that has some.
+
+    Args:
+        worlds: whether those for the leaderboard over worlds (`of_worlds`) are among them.
+    """
+    found = {one.name: [published(one)] for one in tracks()}
+    for name, records in (of_worlds() if worlds else {}).items():
+        found[name].append(records)
+    several = {name: together(tables) for name, tables in found.items()}
+    return {name: records for name, records in several.items() if records.num_rows}
+
+
+def of_worlds() -> dict[str, pa.Table]:
+    """The published records for the leaderboard over worlds alone, by track; those of the newest suite."""
+    with as_file(files(HOME) / "data") as folder:
+        paths = sorted((folder / suites.suite(WORLDS).name).glob("*.parquet"))
+        found = {one.name: _read(one, paths) for one in tracks()}
     return {name: records for name, records in found.items() if records.num_rows}
 
 
@@ -117,6 +144,38 @@ def publish_faults(folder: Path, home: Path) -> dict[str, int]:
     return found
 
 
+def publish_worlds(folder: Path, home: Path) -> dict[str, int]:
+    """Add the records of a results folder in which `attack=worlds` was driven to the published ones; as `publish`.
+
+    A file has a defended victim in all worlds, wherever it was trained. A file of baselines has those of all worlds.
+
+    Raises:
+        UserError: if the folder has no records, or those of attacks that the suite does not have.
+    """
+    suite = suites.suite(WORLDS)
+    found = {}
+    for track_name, records in reading.read_all(folder).items():
+        attacks = set(pc.unique(records["attack"]).to_pylist())
+        if others := attacks - {member.attack for member in suite.members} - {NO_ATTACK}:
+            raise UserError(
+                f"{folder} must have the records of attack={WORLDS} alone, and has {', '.join(sorted(others))}"
+            )
+        for name, part in _by_name(records, track(track_name)).items():
+            file = home / "data" / suite.name / f"{name}.parquet"
+            part = added(reading.read_file(file), part) if file.exists() else part
+            write_records(part, file)
+            found[f"{suite.name}/{name}"] = int(part.num_rows)
+    return found
+
+
+def _by_name(records: pa.Table, of: Track) -> dict[str, pa.Table]:
+    """The records by the name of a file: that of a defended victim, or of all baselines together."""
+    found: dict[str, list[pa.Table]] = {}
+    for _, defended, part in _rows(records, of):
+        found.setdefault(_name(defended), []).append(part)
+    return {name: pa.concat_tables(parts) for name, parts in found.items()}
+
+
 def _rows(records: pa.Table, of: Track) -> Iterator[tuple[str, Mapping[str, object] | None, pa.Table]]:
     """The grid and the records of each row with what is defended; None for all baselines of a grid together.
 
@@ -140,16 +199,19 @@ def _rows(records: pa.Table, of: Track) -> Iterator[tuple[str, Mapping[str, obje
 
 def _file(folder: Path, defended: Mapping[str, object] | None) -> Path:
     """Where the records of a row are: `VICTIM+DEFENCE.parquet`, with a short hash where another row has that name."""
-    if defended is None:
-        return folder / f"{BASELINES}.parquet"
-    names = [str(defended["victim"])] + [str(defended["defense"])] * (defended["defense"] != "none")
-    plain = folder / f"{'+'.join(names)}.parquet"
-    if not plain.exists():
+    plain = folder / f"{_name(defended)}.parquet"
+    if defended is None or not plain.exists():
         return plain
     # A parameter that came later, with its default, makes no other row.
     if _typed(_defended(plain)) == _typed(defended):
         return plain
     return plain.with_stem(f"{plain.stem}-{hashlib.sha256(canonical(defended).encode()).hexdigest()[:8]}")
+
+
+def _name(defended: Mapping[str, object] | None) -> str:
+    if defended is None:
+        return BASELINES
+    return "+".join([str(defended["victim"])] + [str(defended["defense"])] * (defended["defense"] != "none"))
 
 
 def _defended(file: Path) -> Mapping[str, object]:
@@ -204,8 +266,9 @@ def added(old: pa.Table, new: pa.Table) -> pa.Table:
 
 
 def row_files(home: Path) -> list[Path]:
-    """The records of all rows; not those of baselines and faults."""
-    return [path for path in sorted((home / "data").glob("*/*.parquet")) if path.stem not in (BASELINES, FAULTS)]
+    """The records of all rows; not those of baselines, faults and the leaderboard over worlds."""
+    files = sorted((home / "data").glob("*/*.parquet"))
+    return [path for path in files if path.stem not in (BASELINES, FAULTS) and not _is_of_worlds(path)]
 
 
 def main() -> None:
@@ -214,13 +277,19 @@ def main() -> None:
     parser.add_argument("folder", type=Path, nargs="?", help="results folder; without one the faces are written again")
     parser.add_argument("--add", action="store_true", help="add them to the records of the rows")
     parser.add_argument("--faults", action="store_true", help="add what attack=faults did to rows")
+    parser.add_argument("--worlds", action="store_true", help="add what attack=worlds did in several worlds")
     words = parser.parse_args()
     with as_file(files(HOME)) as home:
         if words.folder is None:
             for file in row_files(home):
                 write_face(file, home)
             return
-        made = publish_faults(words.folder, home) if words.faults else publish(words.folder, home, add=words.add)
+        if words.faults:
+            made = publish_faults(words.folder, home)
+        elif words.worlds:
+            made = publish_worlds(words.folder, home)
+        else:
+            made = publish(words.folder, home, add=words.add)
         for name, episodes in made.items():
             Console().print(f"{name}: {episodes} episodes")
 

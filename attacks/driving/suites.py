@@ -8,3 +8,4 @@ from cavbench.core.suites import Suite
 
 STANDARD_2 = Suite.read(Path(__file__).with_name("standard-2.toml"))
 FAULTS_1 = Suite.read(Path(__file__).with_name("faults-1.toml"))
+WORLDS_1 = Suite.read(Path(__file__).with_name("worlds-1.toml"))

@@ -387,7 +387,7 @@ def report(
         list[str] | None,
         typer.Argument(
             metavar="[NAME] [out=…] [html=…] [json=…] [csv=…] [latex=…]",
-            help="Name of a report (run, cells, leaderboard, beside, flags, thesis; by default run), a results folder, files.",
+            help="Name of a report (run, cells, leaderboard, worlds, beside, flags, thesis; by default run), a folder, files.",
             autocompletion=completed,
         ),
     ] = None,

@@ -19,7 +19,7 @@ from cavbench.records import reading
 
 PAGES = "cavbench.pages"
 FILES = ("json", "csv", "latex")
-PUBLISHED = ("leaderboard", "flags", "thesis")
+PUBLISHED = ("leaderboard", "worlds", "flags", "thesis")
 """Reports that show published records where there is no results folder."""
 KEYS = ("out", "html", *FILES)
 

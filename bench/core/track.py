@@ -202,6 +202,8 @@ class Track(ABC):
     """The names of its baselines (`baseline_of`) in reports, in order."""
     safe_driver: ClassVar[str] = ""
     """The baseline whose rate of `failure` is what safe means; empty for none."""
+    perfect: ClassVar[str] = ""
+    """The baseline that knows all: with that of `contrast` it makes the scale on which worlds are compared. Empty for none."""
     contrast: ClassVar[Contrast | None] = None
     """The baseline that attacked pairs are compared with; None for none."""
     place: ClassVar[str] = ""

@@ -221,6 +221,7 @@ class DrivingTrack(Track):
         CLAIRVOYANT: Baseline(title="perfect information", heading="per-\nfect"),
     }
     safe_driver: ClassVar[str] = IDM
+    perfect: ClassVar[str] = CLAIRVOYANT
     contrast: ClassVar[Contrast | None] = Contrast(
         side="victim",
         baseline=BEST_BLIND,

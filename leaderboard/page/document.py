@@ -24,17 +24,24 @@ from cavbench.leaderboard.page.pairs import (
     threat,
     value,
 )
+from cavbench.leaderboard.page.worlds import world_boards
 from cavbench.leaderboard.ranking.attackers import Attacker, attackers
 from cavbench.leaderboard.ranking.boards import Board, Row
 from cavbench.leaderboard.ranking.columns import Column, columns
 from cavbench.leaderboard.ranking.curves import Curve
 from cavbench.leaderboard.ranking.families import budgets, efforts
 from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.ranking.worlds import WorldBoard
 from cavbench.scenarios import Axes, Cell
 
 
 def document(
-    boards: Sequence[Board], comparisons: Sequence[Comparison], folder: Path | None, link: str = ""
+    boards: Sequence[Board],
+    comparisons: Sequence[Comparison],
+    folder: Path | None,
+    link: str = "",
+    *,
+    worlds: Sequence[WorldBoard] = (),
 ) -> dict[str, Any]:
     """Everything that leaderboards say, as the content of a document (`cavbench.documents`).
 
@@ -43,6 +50,7 @@ def document(
         comparisons: all that was driven.
         folder: the results folder; None where records are published.
         link: the beginning of a link from the page to the results folder.
+        worlds: the leaderboards over worlds.
     """
     everything = [*comparisons, *controls(comparisons)]
     called = {kind: labels(everything, kind) for kind in ("attack", "defense", "victim")}
@@ -51,6 +59,7 @@ def document(
     return {
         "tracks": {name: describe_track(track) for name, track in tracks.items()},
         "boards": [_board(board, keys, called, folder, link) for board in boards],
+        "worlds": world_boards(worlds),
         "pairs": [pair(one, keys[id(one)], called, folder) for one in everything],
         "curves": [
             _curve(found, kind, aligned, keys)

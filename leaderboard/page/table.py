@@ -94,8 +94,64 @@ def _names(column: Mapping[str, Any]) -> list[str]:
 
 
 def latex(made: Mapping[str, Any]) -> str:
-    """The ranked rows of a document as LaTeX: a table a leaderboard, for the package booktabs."""
-    return "\n".join(_tabular(board) for board in made["boards"])
+    """The ranked rows of a document as LaTeX: a table a leaderboard, also over worlds, for the package booktabs."""
+    return "\n".join([*(_tabular(board) for board in made["boards"]), worlds_latex(made)])
+
+
+OVER_WORLDS = (
+    *("track", *BOARD[3:], "rank", "defense", "victim", "trained_in"),
+    *("mean", "mean_low", "mean_high", "worst_world", "world", "grid", "share", "score", "score_low", "score_high"),
+    *("blind", "perfect", "training_seeds", "cells", "scenarios", "lacks"),
+)
+"""The columns of the CSV of leaderboards over worlds: a line a row and world."""
+
+
+def worlds_table(made: Mapping[str, Any]) -> str:
+    """The leaderboards over worlds as CSV: a line for each row in each world that counts or that it was driven in."""
+    out = io.StringIO()
+    writer = csv.DictWriter(out, OVER_WORLDS, lineterminator="\n")
+    writer.writeheader()
+    for board in made["worlds"]:
+        of_board = {"track": board["track"]}
+        of_board |= {f"threat_{name}": value for name, value in board["threat"].items()}
+        for row in board["rows"]:
+            of_row = of_board | {name: row[name] for name in ("rank", "defense", "victim", "trained_in")}
+            of_row |= zip(_ends("mean"), _bounds(row["mean"]), strict=True)
+            of_row["worst_world"] = (row["worst_world"] or {}).get("name")
+            for world in board["worlds"]:
+                name = world["name"]
+                line = of_row | {"world": name, "grid": world["grid"], "lacks": row["lacks"].get(name, "")}
+                place = row["worlds"].get(name)
+                if place:
+                    line |= {key: place[key] for key in ("share", "blind", "perfect", "cells", "scenarios")}
+                    line |= zip(_ends("score"), _bounds(place["score"]), strict=True)
+                    line["training_seeds"] = " ".join(map(str, place["training_seeds"]))
+                writer.writerow({key: cell(value) for key, value in line.items()})
+    return out.getvalue()
+
+
+def worlds_latex(made: Mapping[str, Any]) -> str:
+    """The leaderboards over worlds as LaTeX: a table each, with the shares of the worlds; scores where there are none."""
+    return "\n".join(_worlds_tabular(board) for board in made["worlds"])
+
+
+def _worlds_tabular(board: Mapping[str, Any]) -> str:
+    threat, names = board["threat"], [world["name"] for world in board["worlds"]]
+    shown = "share" if any(row["rank"] for row in board["rows"]) else "score"
+    column = {"kind": "number", "digits": 2}
+    lines = []
+    for row in board["rows"]:
+        worst = row["worst_world"] or {"share": None, "name": ""}
+        places = [(row["worlds"].get(name) or {}).get(shown) for name in names]
+        values = [row["rank"] and str(row["rank"]), row["name"], row["mean"], worst["share"], worst["name"], *places]
+        lines.append([_written(value, column) for value in values])
+    heads = [*map(escaped, ("Rank", "Victim", "Mean over worlds", "Worst world", "In", *names))]
+    title = f"{board['track']} over worlds: {threat['norm']} {threat['budget']:g}, access {threat['access']}"
+    return booktabs(f"{title}, {threat['queries']} queries", "rlrrl" + "r" * len(names), heads, lines)
+
+
+def _bounds(found: Mapping[str, Any] | None) -> list[Any]:
+    return [(found or {}).get(end) for end in ("estimate", "low", "high")]
 
 
 def _tabular(board: Mapping[str, Any]) -> str:

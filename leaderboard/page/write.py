@@ -30,7 +30,10 @@ from cavbench.leaderboard.page.table import latex, table
 from cavbench.leaderboard.published import every_track
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.ranking.published_worlds import published_worlds
+from cavbench.leaderboard.ranking.worlds import over_several
 from cavbench.leaderboard.terminal.ranking import print_boards
+from cavbench.leaderboard.terminal.worlds import print_worlds
 from cavbench.leaderboard.thesis import chapters
 from cavbench.records import reading
 from cavbench.run.process import follow_parent
@@ -46,7 +49,7 @@ def write_beside(out: Path | None, page: Path, console: Console) -> None:
     """
     if out is None:
         raise UserError("there is no folder results; choose another with out=")
-    write(out, page, console, published=every_track())
+    write(out, page, console, published=every_track(worlds=True))
 
 
 def write(out: Path | None, page: Path, console: Console, *, published: Mapping[str, pa.Table] | None = None) -> None:
@@ -72,7 +75,9 @@ def write(out: Path | None, page: Path, console: Console, *, published: Mapping[
         # The published rows are no records of a user: the thesis' tables have records of their own.
         thesis = beside.submit(chapters.chapters, {} if out is None else chapters.needed(records))
         boards, comparisons = read_boards(records, published)
-        made = documents.document("leaderboard", document(boards, comparisons, out, _link(out, page)))
+        worlds = published_worlds(boards) if out is None else over_several(boards)
+        content = document(boards, comparisons, out, _link(out, page), worlds=worlds)
+        made = documents.document("leaderboard", content)
         texts = {
             _files(page)[0]: documents.written(made, indent=None),
             _files(page)[1]: table(made),
@@ -88,6 +93,7 @@ def write(out: Path | None, page: Path, console: Console, *, published: Mapping[
     except OSError as error:
         raise UserError(f"the page {page} cannot be written: {error.strerror}") from error
     print_boards(boards, console)
+    print_worlds(worlds, console)
     for path in sorted(texts):
         console.print(Text(f" {path} ({path.stat().st_size / 1e6:.2f} MB)"), soft_wrap=True)
 

@@ -16,6 +16,8 @@ from cavbench.leaderboard.ranking.boards import Board, Row, read_boards
 from cavbench.leaderboard.ranking.columns import Called, columns
 from cavbench.leaderboard.ranking.columns import Column as Ranked
 from cavbench.leaderboard.ranking.flags import FLAGS
+from cavbench.leaderboard.ranking.published_worlds import published_worlds
+from cavbench.leaderboard.ranking.worlds import over_several
 from cavbench.leaderboard.terminal.attackers import print_attackers
 from cavbench.leaderboard.terminal.layout import STRIP, Column, Section, axis, fitted
 from cavbench.leaderboard.terminal.text import (
@@ -32,6 +34,7 @@ from cavbench.leaderboard.terminal.text import (
     strip,
     verdict,
 )
+from cavbench.leaderboard.terminal.worlds import print_worlds
 from cavbench.statistics.estimates import Interval, share_interval
 
 ADDED = 0.01
@@ -45,7 +48,9 @@ def leaderboard_report(records: Mapping[str, pa.Table], console: Console) -> Non
         records: by track (`cavbench.records.schema`); where there are none, the published records count.
         console: where to print.
     """
-    print_boards(read_boards(records or every_track())[0], console)
+    boards = read_boards(records or every_track())[0]
+    print_boards(boards, console)
+    print_worlds(over_several(boards) if records else published_worlds(boards), console)
 
 
 def beside_report(records: Mapping[str, pa.Table], console: Console) -> None:
@@ -58,7 +63,9 @@ def beside_report(records: Mapping[str, pa.Table], console: Console) -> None:
     Raises:
         UserError: if nothing was attacked.
     """
-    print_boards(read_boards(records, every_track())[0], console)
+    boards = read_boards(records, every_track(worlds=True))[0]
+    print_boards(boards, console)
+    print_worlds(over_several(boards), console)
 
 
 def flags_report(records: Mapping[str, pa.Table], console: Console) -> None:

@@ -11,8 +11,10 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
+from cavbench.core import suites
 from cavbench.core.track import Track, tracks
-from cavbench.leaderboard.published import publish, published, rounded
+from cavbench.errors import UserError
+from cavbench.leaderboard.published import publish, publish_worlds, published, rounded, row_files
 from cavbench.records import reading
 from cavbench.records import store as results
 from cavbench.records.schema import schema
@@ -137,3 +139,24 @@ def test_added_records_renew_a_training_seed_and_leave_the_others(tmp_path: Path
         scores_of(first, 2),
     ]
     assert scores_of(again, 1) != scores_of(first, 1)
+
+
+def test_records_of_worlds_are_a_file_a_defended_victim_and_rank_nothing_within_a_world(tmp_path: Path) -> None:
+    def world(name: str) -> pa.Table:
+        records = pa.concat_tables([row(), baseline_drivers(episodes=20)])
+        # Units and pairs are hashes of all that they are of, the world too.
+        renamed = {key: [f"{one}{name}" for one in records[key].to_pylist()] for key in ("unit", "pair")}
+        for column, values in {**renamed, "world": [name] * records.num_rows}.items():
+            place = records.schema.get_field_index(column)
+            records = records.set_column(place, records.schema.field(place), pa.array(values))
+        return records
+
+    suite = suites.suite("worlds").name
+    found = publish_worlds(ran(tmp_path / "one", world("highway"), world("merge")), tmp_path)
+    assert list(found) == [f"{suite}/dqn", f"{suite}/baselines"]
+    again = publish_worlds(ran(tmp_path / "two", world("exit")), tmp_path)
+    assert {name: again[name] - count for name, count in found.items()} == {n: c // 2 for n, c in found.items()}
+    assert row_files(tmp_path) == []
+    assert not (tmp_path / "rows").exists()
+    with pytest.raises(UserError, match="must have the records of attack=worlds alone, and has plan"):
+        publish_worlds(ran(tmp_path / "other", drive(attack="plan")), tmp_path)

@@ -410,20 +410,42 @@ function drawAttackers(board) {
     one("CPU s / episode", "seconds", (value) => fixed(value, value < 10 ? 2 : 0)),
   ], board.attackers);
 }
-/* The same defended victims in other worlds and grids, under the same norm and budget. */
+/* The same defended victims in several worlds; the ranks and shares are those of the document. */
+function worldsOf(board) {
+  const near = (one, names) => names.every((name) => one.threat[name] === board.threat[name]);
+  const found = data.worlds.filter((one) => one.track === board.track && near(one, ["norm", "budget", "share"]));
+  return found.find((one) => near(one, ["access", "queries"])) ?? found[0];
+}
 function drawWorlds(board) {
-  const alike = data.boards.filter((one) => one.track === board.track && ["norm", "budget", "share"].every((name) => one.threat[name] === board.threat[name]));
-  const places = [...new Map(alike.map((one) => [`${one.world.name}, ${one.grid}`, one])).entries()];
-  const rows = board.rows.filter(chosen).map((row) => ({ row, found: places.map(([, one]) => one.rows.find((other) => sameDefended(other, row))) }))
-    .filter(({ found }) => found.filter(Boolean).length > 1);
-  at("worlds-section").hidden = places.length < 2 || !rows.length;
-  const score = (other) => el("td", { class: "value", style: tint(other.values.score.estimate) }, fixed(other.values.score.estimate), el("small", {}, bounds(other.values.score)));
+  const found = worldsOf(board);
+  const first = (text) => text.split(/[ (]/)[0];
+  const kept = (row) => ["defense", "victim"].every((kind) => !state[kind] || first(state[kind]) === first(row[kind]));
+  const rows = (found?.rows ?? []).filter(kept);
+  at("worlds-section").hidden = !rows.length;
+  if (!rows.length) return;
+  const scale = rows.some((row) => row.rank), names = found.worlds.map(({ name }) => name);
+  at("worlds-said").textContent = `${threatName(found.threat)}. ` + (scale
+    ? "A share of 0 is the best blind policy of the world, 1 is perfect information; below it is the score. Each row under the attacks that it met in all of its worlds."
+    : "The score under the strongest attacks that a row met in all of its worlds.");
+  const value = (row, name) => {
+    const one = row.worlds[name], share = one?.share ?? null;
+    if (!one) return el("td", { class: "value" }, el("small", {}, row.lacks[name] ?? ""));
+    const big = scale ? share : one.score.estimate;
+    const small = scale ? `score ${short(one.score.estimate)}` : bounds(one.score);
+    return el("td", { class: "value", style: big == null ? null : tint(big), title: row.lacks[name] ?? null }, fixed(big), el("small", {}, small));
+  };
+  const heads = scale ? ["Rank", "Defended victim", "Mean over worlds", "Worst world"] : ["Defended victim"];
   at("worlds").replaceChildren(
-    el("thead", {}, el("tr", {}, el("th", { scope: "col" }, "Defence · victim"), ...places.map(([name]) => el("th", { scope: "col" }, name)))),
-    el("tbody", {}, ...rows.map(({ row, found }) => el("tr", {}, el("th", { scope: "row" }, `${row.defense.label} · ${row.victim.label}`), ...found.map((other) => (other ? score(other) : el("td", { class: "value" }, "")))))));
+    el("thead", {}, el("tr", {}, ...[...heads, ...names].map((name) => el("th", { scope: "col" }, name)))),
+    el("tbody", {}, ...rows.map((row) => el("tr", { class: row.mine ? "mine" : null },
+      ...(scale ? [el("td", { class: "number" }, row.rank ?? "—")] : []),
+      el("th", { scope: "row" }, row.name, row.mine ? el("small", { class: "yours" }, " ▸ yours") : ""),
+      ...(scale ? [el("td", { class: "value" }, ...estimate(row.mean)), el("td", { class: "value" }, fixed(row.worst_world?.share ?? null), el("small", {}, row.worst_world?.name ?? ""))] : []),
+      ...names.map((name) => value(row, name))))));
+  at("worlds-notes").replaceChildren(...found.notes.map((text) => el("li", {}, text)));
   at("worlds").copied = () => ({
-    heads: [{ name: "defence" }, { name: "victim" }, ...places.map(([name]) => ({ name, interval: true }))],
-    rows: rows.map(({ row, found }) => [row.defense.label, row.victim.label, ...found.map((other) => other?.values.score ?? { estimate: null })]),
+    heads: [{ name: "rank" }, { name: "victim" }, { name: "mean over worlds", interval: true }, { name: "worst world" }, ...names.map((name) => ({ name: `share in ${name}` })), ...names.map((name) => ({ name: `score in ${name}`, interval: true }))],
+    rows: rows.map((row) => [row.rank, row.name, row.mean ?? { estimate: null }, row.worst_world?.name ?? null, ...names.map((name) => row.worlds[name]?.share ?? null), ...names.map((name) => row.worlds[name]?.score ?? { estimate: null })]),
   });
 }
 function drawPairs(board, metric) {
