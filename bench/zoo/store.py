@@ -90,12 +90,17 @@ def save(
         root: folder of a zoo; by default the user's own, which takes precedence over the shipped one.
 
     Raises:
-        UserError: if the recipe does not name the non-default parameters of the world.
+        UserError: if the recipe does not name the non-default parameters of the world, or a weight is NaN.
     """
     check_world(recipe, world)
+    state = {key: value.contiguous() for key, value in network.state_dict().items()}
+    if broken := [key for key, value in state.items() if value.is_floating_point() and value.isnan().any()]:
+        raise UserError(
+            f"training {recipe.name}, seed {seed} ended with NaN in {len(broken)} of {len(state)} tensors, {broken[0]!r} the "
+            "first: nothing is saved; try a lower learning rate"
+        )
     folder = (root or own()) / recipe.key
     folder.mkdir(parents=True, exist_ok=True)
-    state = {key: value.contiguous() for key, value in network.state_dict().items()}
     if start is not None and start.weights_sha256:
         taken = _unchanged(state, start)
         card = {**card, "start": {"sha256": start.weights_sha256, "tensors": taken}}

@@ -191,7 +191,9 @@ def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
 
 def on_square(part: Box, face_from_pixel: Array, spot: Spot) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Where the samples of pixels are on a square beside or on the sign [h * S, w * S, 2], and whether inside [h, S, w, S]."""
-    place = (_sampled(part, face_from_pixel) - np.float32(spot[:2])) / (np.float32(spot[2:]) - np.float32(spot[:2]))
+    left, top, right, bottom = spot
+    sides = np.array([right - left, bottom - top], np.float32)
+    place = (_sampled(part, face_from_pixel) - np.array([left, top], np.float32)) / sides
     inside = ((place >= 0) & (place <= 1)).all(-1)
     return place, inside.reshape(part[3] - part[1], SUPERSAMPLING, part[2] - part[0], SUPERSAMPLING)
 

@@ -64,6 +64,22 @@ def test_a_policy_loads_as_it_was_saved(saved: Path) -> None:
     assert zoo.seeds(RECIPE) == [3]
 
 
+def test_a_training_that_ended_with_nan_is_not_saved(home: Path, highway: DrivingWorld) -> None:
+    """Infinite constants, as a mask has them, are no fault."""
+    network = QPolicy(5, 5, 8)
+    network.register_buffer("mask", torch.tensor(float("-inf")))
+    zoo.save(network, RECIPE, seed=3, world=highway, card={})
+    weight = next(network.parameters())
+    with torch.no_grad():
+        weight[0, 0] = float("nan")
+    with pytest.raises(
+        UserError, match=r"training dqn.*, seed 4 ended with NaN in 1 of \d+ tensors, '.*' the first"
+    ) as error:
+        zoo.save(network, RECIPE, seed=4, world=highway, card={})
+    assert "\n" not in str(error.value)
+    assert zoo.seeds(RECIPE) == [3]
+
+
 def test_tampered_weights_are_refused(saved: Path) -> None:
     blob = bytearray(saved.read_bytes())
     blob[-1] ^= 1

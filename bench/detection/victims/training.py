@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import torch
@@ -50,7 +50,7 @@ def descend(
         FloatingPointError: if the loss is NaN or infinite.
     """
     start = time.process_time()
-    mean = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(decay), use_buffers=True)
+    mean = AveragedModel(network, multi_avg_fn=_average(decay), use_buffers=True)
     weights = [weight for weight in network.parameters() if weight.requires_grad]
     adam = torch.optim.AdamW(weights, lr=learning_rate, weight_decay=5e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(adam, learning_rate, total_steps=updates, pct_start=warm_up)
@@ -74,3 +74,18 @@ def descend(
         checkpoint.done()
     averaged: Network = mean.module  # type: ignore[assignment]
     return averaged, time.process_time() - start
+
+
+def _average(decay: float) -> Callable[[Sequence[Tensor], Sequence[Tensor], Tensor | int], None]:
+    """The exponential moving average, for all tensors that are not their own average.
+
+    `lerp` of an infinite constant with itself is NaN. A graph pads with such constants, and an attention mask is one.
+    """
+    moved = get_ema_multi_avg_fn(decay)
+
+    def average(means: Sequence[Tensor], now: Sequence[Tensor], count: Tensor | int) -> None:
+        pairs = [pair for pair in zip(means, now, strict=True) if not torch.equal(*pair)]
+        if pairs:
+            moved(*(list(part) for part in zip(*pairs, strict=True)), count)
+
+    return average
