@@ -58,7 +58,7 @@ ROWS = {
 }
 WORLDS = (
     *("highway", "merge", "highway-v0", "highway-fast-v0"),
-    *("roundabout", "intersection", "exit", "two_way", "racetrack", "u_turn", "recorded"),
+    *("roundabout", "intersection", "exit", "two_way", "racetrack", "u_turn", "recorded", "platoon"),
 )
 DETECTORS = ("yolov5", "yolov3_tiny", "fcos", "rcnn")
 DRIVEN, DETECTED, SLOW, SLOW_S = (2, 40), (1, 3), 6, 8.0

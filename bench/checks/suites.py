@@ -84,7 +84,8 @@ def _suites(subject: Subject, track_name: str, victim: str, world: str) -> Itera
             f"the track {track_name!r} has no checks for this kind of component (entry point {kits.KITS})"
         )
     if subject.kind != "world":
-        tried_in = choose("world", world or track(track_name).world).component
+        own = getattr(subject.component, "made_for", "")
+        tried_in = choose("world", world or own or track(track_name).world).component
         if not tried_in.serves(track_name):
             raise NotApplicableError(f"world {world!r} belongs to another track")
         subject = replace(subject, world=tried_in)

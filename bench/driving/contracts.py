@@ -163,6 +163,8 @@ class DrivingVictim(Victim):
     """Who is at the wheel; its policies must have the same. Only a victim that does not see may leave it to the world."""
     policy_type: ClassVar[type[Policy] | None] = None
     """The class of its trained policies; the zoo builds it from a card."""
+    made_for: ClassVar[str] = ""
+    """Name of the world that it is checked in, if it is of no use in the usual one."""
     brakes_to: ClassVar[float | None] = None
     """The target speed in m/s that SLOWER must be able to end at; None if it needs none. A run warns where it cannot."""
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from cavbench.core.contracts import Facts
 from cavbench.driving.kinematics import Kinematics
+from cavbench.driving.platooning import Platooning
 from cavbench.driving.sets import Traffic
 from cavbench.driving.surroundings import USUAL, Surroundings
 
@@ -65,6 +66,7 @@ class Features:
         fixed: names of the features that no attack can change, like `presence`: flags, one-hot codes, the clock.
         present: of each feature, the number of the feature without which there is nothing to measure, and no attack can change
             it: the presence of a car in a flat observation; -1 for none. Empty if all are always there.
+        messages: number of the first row that other cars told by radio, and not a sensor; 0 if none is.
 
     Raises:
         ValueError: if `fixed` names a feature that there is not, or `present` is not a number for each feature.
@@ -77,6 +79,7 @@ class Features:
     floors: tuple[float, ...] = ()
     fixed: tuple[str, ...] = ()
     present: tuple[int, ...] = ()
+    messages: int = 0
 
     def __post_init__(self) -> None:
         if self.present and (
@@ -100,8 +103,9 @@ class Features:
         return (observation[..., 1:][..., places] > 0) | (places < 0)
 
     def written(self) -> dict[str, Any]:
-        """As plain JSON values for records; without `fixed` and `present` if there are none, as in records from before them."""
-        return {name: value for name, value in asdict(self).items() if name not in ("fixed", "present") or value}
+        """As plain JSON values for records; without `fixed`, `present` and `messages` if there are none, as in older records."""
+        later = ("fixed", "present", "messages")
+        return {name: value for name, value in asdict(self).items() if name not in later or value}
 
     def half_range(self) -> Tensor:
         """[F - 1] size of one normalised unit, in physical units."""
@@ -142,6 +146,7 @@ class DrivingFacts(Facts):
         controls: names of the controls of a continuous action, each in [-1, 1]; empty if it takes none.
         unbounded: whether the world's own environment declares Box(-inf, inf) for values in [-1, 1], as highway-env does.
         lanes: the lanes of the road in a cell, for recordings; empty if they are straight, parallel and 4 m wide.
+        platooning: how the cars of a platoon move and what they are told; None in other worlds.
         environment: the call that makes the world's gymnasium environment, for messages; empty if the world does not say.
     """
 
@@ -155,6 +160,7 @@ class DrivingFacts(Facts):
     controls: tuple[str, ...] = CONTROLS
     unbounded: bool = False
     lanes: tuple[LaneShape, ...] = ()
+    platooning: Platooning | None = None
     environment: str = ""
 
     def native(self, observation: Tensor) -> Tensor:
@@ -196,7 +202,7 @@ class DrivingFacts(Facts):
             "drivers": list(self.drivers),
         }
         # No report reads them.
-        for name in ("kinematics", "shape", "limits", "rows", "unbounded", "lanes", "environment"):
+        for name in ("kinematics", "shape", "limits", "rows", "unbounded", "lanes", "platooning", "environment"):
             del values[name]
         # As in records from before it.
         if self.controls in (CONTROLS, ()):

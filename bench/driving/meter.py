@@ -16,6 +16,7 @@ from cavbench.driving.features import DrivingFacts
 from cavbench.driving.forging import Used
 from cavbench.driving.metrics import safe_progress
 from cavbench.driving.policy import State, rows_of
+from cavbench.driving.strings import Strings
 from cavbench.driving.victim import CountedPolicy
 
 CHANGED = 0.1
@@ -54,6 +55,7 @@ class Meter:
         self.gradients, self.zero_gradients, self.nan_gradients = np.zeros((3, batch))
         self.assured = np.zeros(batch)
         self.watched = Alarms(subject.policy, batch, 1 / facts.decision_hz)
+        self.strings = Strings(batch, 1 / facts.decision_hz)
         self.used = np.full((len(self.FORGED), batch), 0.0 if forges else np.nan)
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
@@ -95,6 +97,7 @@ class Meter:
         self.crashed |= info["crashed"] & running
         self.offroad |= info["offroad"] & running
         np.copyto(self.end_x, info["x"], where=running)
+        self.strings.step(info, running)
         assured = self.subject.policy.assured(shown.observation, state)
         self.assured += np.nan if assured is None else np.where(running, assured.numpy(), 0.0)
         self.watched.step(shown.observation, state, running, running & (linf > 0))
@@ -159,6 +162,7 @@ class Meter:
             "action_counts": self._action_counts(),
             "assured": self.assured / steps,
             **self.watched.columns(),
+            **self.strings.columns(),
             "gradient_queries": self.gradients / steps,
             "zero_gradients": self._share_of_gradients(self.zero_gradients),
             "nan_gradients": self._share_of_gradients(self.nan_gradients),

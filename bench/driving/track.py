@@ -176,6 +176,37 @@ BLAME: tuple[pa.Field, ...] = (
 )
 
 
+STRINGS: tuple[pa.Field, ...] = (
+    field(
+        "min_time_gap_s",
+        FLOAT,
+        "smallest time to the place of the car ahead, bumper to bumper, at the own speed; null in a world that does not say",
+        "s",
+        nullable=True,
+        low=0,
+        high=inf,
+    ),
+    field(
+        "amplification",
+        FLOAT,
+        "L2 norm of the ego's acceleration over that of the car ahead, from 20 s on; above 1 is not string stable; null as "
+        "`min_time_gap_s`, and in shorter episodes",
+        "ratio",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "amplification_peak",
+        FLOAT,
+        "the same of the largest accelerations (L-infinity)",
+        "ratio",
+        nullable=True,
+        low=0,
+    ),
+)
+"""What a car in a platoon does to those behind it."""
+
+
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
 
@@ -185,8 +216,17 @@ class DrivingTrack(Track):
 
     unrepeatable: ClassVar[tuple[str, ...]] = ("attack_ms",)
     measurements: ClassVar[tuple[pa.Field, ...]] = MEASUREMENTS
-    probes: ClassVar[tuple[pa.Field, ...]] = (*PROBES, ASSURED, SHIFT, NAN_GRADIENTS, *ALARMS, *FORGED, *BLAME)
-    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME))
+    probes: ClassVar[tuple[pa.Field, ...]] = (
+        *PROBES,
+        ASSURED,
+        SHIFT,
+        NAN_GRADIENTS,
+        *ALARMS,
+        *FORGED,
+        *BLAME,
+        *STRINGS,
+    )
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME, *STRINGS))
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     sets: ClassVar[Mapping[str, type[Any]]] = {
         "presence": Presence,
@@ -205,6 +245,8 @@ class DrivingTrack(Track):
         Measure(column="offroad", heading="off\nroad", unit="share", tables="overview", spare=4),
         Measure(column="avoidable", heading="avoid-\nable", unit="share", of_attack=True, spare=1),
         Measure(column="min_ttc_s", heading="min\nTTC s", how="median", digits=1, tables="overview", spare=6),
+        Measure(column="min_time_gap_s", heading="min\ngap s", how="median", digits=2, tables="overview", spare=1),
+        Measure(column="amplification", heading="ampli-\nfication", digits=2, tables="overview", spare=1),
         Measure(column="changed", heading="success\n/ step", how="step mean", unit="share", of_attack=True, spare=2),
         Measure(column="queries", heading="queries\n/ step", how="step mean", of_attack=True),
         Measure(column="attack_ms", heading="ms\n/ step", how="step mean", digits=1, of_attack=True, spare=3),
@@ -212,7 +254,8 @@ class DrivingTrack(Track):
     legend: ClassVar[str] = (
         "safe progress: 0 if the car crashes or leaves the road, otherwise its mean progress. success: share of steps in which "
         "the attack changed the decision. TTC: time to collision with the car ahead. best blind: the best policy that "
-        "ignores its input. avoidable: share of the crashes that a planner with perfect information avoids in the same traffic."
+        "ignores its input. gap: smallest time gap. amplification: of the accelerations of the car ahead (L2). avoidable: share "
+        "of the crashes that a planner with perfect information avoids in the same traffic."
     )
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         BEST_BLIND: Baseline(title="best blind policy", heading="best\nblind", spare=0),

@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 
 from cavbench.core.track import Track, tracks
 from cavbench.errors import UserError
-from cavbench.records.schema import earlier, schema
+from cavbench.records.schema import written_by
 
 LONGEST_FOOTER = 2**26
 """Most bytes of the footer of a Parquet file, which names its columns and where they are."""
@@ -36,7 +36,7 @@ def track_of(path: Path) -> Track:
         reason = "missing" if isinstance(error, FileNotFoundError) else "truncated or not Parquet"
         raise UserError(f"the record {path} is {reason}; delete it and run again to recreate it") from None
     for track in tracks():
-        if found.equals(schema(track)) or found.equals(earlier(track)):
+        if written_by(track, found):
             return track
     raise UserError(f"the record {path} has columns that this version does not write; use another folder with out=")
 

@@ -109,10 +109,14 @@ def schema(track: Track) -> pa.Schema:
     return pa.schema(columns, metadata={"cavbench": VERSION, "track": track.name})
 
 
-def earlier(track: Track) -> pa.Schema:
-    """The schema of records that were written before a track had its `later` columns, which are null in them."""
-    whole = schema(track)
-    return pa.schema([one for one in whole if one.name not in track.later], metadata=whole.metadata)
+def written_by(track: Track, found: pa.Schema) -> bool:
+    """Whether a file with this schema has records of a track: of now, or from before it had some of its `later` columns.
+
+    These columns are null in such records.
+    """
+    whole, names = schema(track), set(found.names)
+    kept = [one for one in whole if one.name in names or one.name not in track.later]
+    return bool(found.equals(pa.schema(kept, metadata=whole.metadata)))
 
 
 def encoded(track: Track, names: Sequence[str] | None = None) -> pa.Schema:

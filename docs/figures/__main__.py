@@ -81,6 +81,7 @@ FIGURES = {
     "world_racetrack.svg": "roads:racetrack",
     "world_u_turn.svg": "roads:u_turn",
     "world_sumo.svg": "sumo:sumo",
+    "world_platoon.svg": "platoon:world",
     "world_camera.webp": "camera:world",
     "world_crossing.png": "crossing:world",
     "world_places.png": "camera:places",

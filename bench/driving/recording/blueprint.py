@@ -17,7 +17,7 @@ def layout(episode: Episode) -> rrb.Blueprint:
     """The blueprint of an episode; empty views are left out."""
     rows: list[rrb.Container | rrb.View] = []
     shares: list[float] = []
-    if {"x", "y"} <= set(episode.features.names):
+    if episode.on_road:
         rows.append(_road(episode))
         shares.append(2.6)
     if episode.discrete:

@@ -79,8 +79,15 @@ class Episode:
         """[T, V - 1] whether a row contains another vehicle."""
         return np.asarray(self.steps["observation"][:, 1:, 0], dtype=np.float64) > 0
 
+    @property
+    def on_road(self) -> bool:
+        """Whether the places of cars are measured; across the road they need not be, where its lanes are known."""
+        return "x" in self.features.names and ("y" in self.features.names or bool(self.facts.lanes))
+
     def physical(self, name: str, feature: str) -> Array:
-        """[T, V] a feature of `observation` or `perturbed` (`name`), in its physical unit."""
+        """[T, V] a feature of `observation` or `perturbed` (`name`), in its physical unit; a `y` that is not measured is 0."""
+        if feature == "y" and "y" not in self.features.names:
+            return np.zeros(self.steps[name].shape[:2])
         place = self.features.names.index(feature)
         low, high = self.features.low[place], self.features.high[place]
         normalised = np.asarray(self.steps[name][:, :, 1 + place], dtype=np.float64)

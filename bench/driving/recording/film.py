@@ -41,7 +41,7 @@ SCALE = WIDTH / (BEHIND + AHEAD)
 HIGH = 56.0
 """Metres of the picture from above to below the ego, where the road bends."""
 GRASS: Colour = (228, 233, 222)
-HEADER, MARGIN, KEY, BAND, LEGEND, PLOT = 36, 10, 22, 22, 26, 62
+HEADER, MARGIN, KEY, BAND, LEGEND, VALUES, PLOT = 36, 10, 22, 22, 26, 16, 62
 LEFT = 170
 """Where the time axes begin; their labels are before it."""
 RIGHT = WIDTH - 20
@@ -56,7 +56,7 @@ class EpisodeFilm(Film):
 
     def __init__(self, episode: Episode) -> None:
         self.episode, self.fps = episode, episode.facts.decision_hz
-        self.has_road = {"x", "y"} <= set(episode.features.names)
+        self.has_road = episode.on_road
         self.plan = Plan(episode) if episode.facts.lanes and self.has_road else None
         self.stands = self.plan is not None and self.plan.bends
         if self.has_road:
@@ -66,7 +66,7 @@ class EpisodeFilm(Film):
         self.bands_top = self.road_top + (self.road_height + MARGIN + KEY if self.has_road else 0)
         self.bands = self._bands()
         self.legend_top = self.bands_top + MARGIN + len(self.bands) * (BAND + 4)
-        self.plots_top = self.legend_top + (LEGEND if self.bands else 0)
+        self.plots_top = self.legend_top + (LEGEND if self.bands else VALUES)
         self.plots = self._plots()
         self.height = self.plots_top + (PLOT + MARGIN) * len(self.plots)
 
@@ -186,7 +186,7 @@ class EpisodeFilm(Film):
         if not episode.discrete:
             _, taken = episode.choices
             words = [f"{name} {value:+.2f}" for name, value in zip(episode.facts.controls, taken[step], strict=True)]
-            write(picture, "     ".join(words), 12, self.bands_top + 2, size=14, colour=GREY)
+            write(picture, "     ".join(words), 12, self.bands_top + 12, size=14, colour=GREY)
 
     def _road(self, picture: Picture, step: int) -> None:
         road = picture[self.road_top : self.road_top + self.road_height]

@@ -29,7 +29,7 @@ LAYERS = (("road/edges", PAINT, 0.1, 0.0), ("road/surface", ASPHALT, -0.1, 1.0))
 
 def log(episode: Episode, columns: Columns) -> None:
     """Send the road and the cars, if the observation has positions."""
-    if not {"x", "y"} <= set(episode.features.names):
+    if not episode.on_road:
         return
     _road(episode, columns)
     _cars(episode, columns)
