@@ -83,12 +83,11 @@ class Follower(Policy):
         raise NotImplementedError
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
-        return (self.command(observation, state) / self.rows.platooning.braking).unsqueeze(-1)
-
-    def choose(self, scores: Tensor) -> Tensor:
-        limits = self.rows.platooning
-        # Not in `scores`, which would have no gradient at the limits.
-        return scores.clamp(-1.0, limits.acceleration / limits.braking)
+        limits, command = self.rows.platooning, self.command(observation, state)
+        share = command / limits.braking
+        # Within what the car can do; with a gradient beyond it, too (straight-through).
+        limited = share.detach().clamp(-1.0, limits.acceleration / limits.braking) + (share - share.detach())
+        return limited.unsqueeze(-1)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
