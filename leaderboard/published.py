@@ -27,6 +27,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from rich.console import Console
 
+from cavbench.core import suites
 from cavbench.core.registry import Kind
 from cavbench.core.track import Track, track, tracks
 from cavbench.errors import UserError
