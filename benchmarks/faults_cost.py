@@ -1,6 +1,7 @@
 """Measures what a unit under a fault costs, as a ratio to the same unit without one:
 
     python benchmarks/faults_cost.py [--victim dqn] [--defense none] [--episodes 20] [--rounds 3] [--severity 2]
+        [--modes ghosts noise]
 
 CPU seconds of a unit, and for each frame of its batch, since episodes end earlier under a fault. Both are driven alternately in
 one process and one thread, on scenarios that tune attacks. The medians of the ratios of the rounds are printed.
@@ -12,9 +13,8 @@ import argparse
 import statistics
 import time
 from dataclasses import replace
-from typing import get_args
 
-from cavbench.attacks.driving.fault import Mode
+from cavbench.core import sets, suites
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Job
 from cavbench.driving import ObservationThreat
@@ -42,6 +42,7 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=20)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--severity", type=int, default=2)
+    parser.add_argument("--modes", nargs="*")
     arguments = parser.parse_args()
     settle()
     pair = Pair(
@@ -55,8 +56,11 @@ def main() -> None:
     _cost(clean, 2)
     print("| fault | unit | frame |\n|---|---|---|")
     ratios = []
-    for mode in get_args(Mode):
-        attacked = replace(pair, attack=choose("attack", "fault", mode=mode, severity=arguments.severity))
+    for member in suites.suite("faults").members:
+        mode = member.params["mode"]
+        if member.params["severity"] != arguments.severity or mode not in (arguments.modes or [mode]):
+            continue
+        attacked = replace(pair, attack=member.chosen, threat=sets.widened(pair.threat, member.threat))
         rounds = [
             (_cost(attacked, arguments.episodes), _cost(clean, arguments.episodes)) for _ in range(arguments.rounds)
         ]

@@ -8,7 +8,8 @@
 
 A row is a defended victim on a grid. Its records are `data/GRID/NAME.parquet`, its face is `rows/GRID/NAME.json`
 (`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid,
-which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`. So are those of faults, `data/faults-1/faults.parquet`.
+which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`. So are those of faults, of every
+version of their suite: `data/faults/faults.parquet`.
 Records of the suite `worlds` are read by the leaderboard over worlds alone: `data/worlds-1/NAME.parquet`, a file for all worlds.
 """
 
@@ -138,7 +139,7 @@ def publish_faults(folder: Path, home: Path) -> dict[str, int]:
             raise UserError(
                 f"{folder} must have the records of attack=faults alone, and has {', '.join(sorted(attacks))}"
             )
-        file = home / "data" / suites.suite("faults").name / f"{FAULTS}.parquet"
+        file = home / "data" / FAULTS / f"{FAULTS}.parquet"
         write_records(added(reading.read_file(file), records) if file.exists() else records, file)
         found[f"{file.parent.name}/{file.stem}"] = int(reading.read_file(file).num_rows)
     return found

@@ -12,11 +12,12 @@ from torch import Tensor
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Natural
 from cavbench.driving import DrivingAttack, Forgery
+from cavbench.errors import UserError
 
 if TYPE_CHECKING:
     from cavbench.driving import Features, Oracle, State
 
-Mode = Literal["dropout", "ghosts", "latency", "freeze", "quantise", "drift", "noise", "late", "lost"]
+Mode = Literal["dropout", "ghosts", "latency", "freeze", "quantise", "drift", "noise", "late", "lost", "rude", "polite"]
 DROPPED = (0.002, 0.01, 0.05)
 """Probability that a row is missing in a frame."""
 APPEARING = (0.005, 0.02, 0.1)
@@ -39,7 +40,20 @@ LOST = (0.05, 0.2, 0.5)
 """Probability that a command is lost in a frame."""
 IDLE = 1
 """The discrete action of a car whose command is lost; a continuous one is 0."""
-MEMORYLESS = ("dropout", "latency", "quantise", "late", "lost")
+MANNERS: dict[str, tuple[dict[str, float], dict[str, float], dict[str, float]]] = {
+    "rude": (
+        {"time_gap": 1.0, "braking": 6.0, "lane_gain": 0.1, "imposed_braking": 3.0},
+        {"time_gap": 0.6, "braking": 7.0, "lane_gain": 0.0, "imposed_braking": 5.0},
+        {"time_gap": 0.3, "braking": 8.0, "lane_gain": -0.2, "imposed_braking": 8.0},
+    ),
+    "polite": (
+        {"time_gap": 2.0, "braking": 4.0, "politeness": 0.3, "imposed_braking": 1.5},
+        {"time_gap": 2.5, "braking": 3.0, "politeness": 0.6, "imposed_braking": 1.0},
+        {"time_gap": 3.5, "braking": 2.0, "politeness": 1.0, "imposed_braking": 0.5},
+    ),
+}
+"""How the traffic drives: fields of `cavbench.driving.Surroundings`, which the threat model must have."""
+MEMORYLESS = ("dropout", "latency", "quantise", "late", "lost", *MANNERS)
 """Modes in which a frame does not depend on those before it."""
 NEEDS: dict[str, tuple[str, ...]] = {
     "dropout": ("presence.hidden=9",),
@@ -69,6 +83,10 @@ class Fault(DrivingAttack):
     | `noise` | noise that is correlated over 1 s | with a deviation of 1, 2, 4 resolutions |
     | `late` | commands are executed late | 1, 2, 4 decisions |
     | `lost` | a command is lost, and the car idles | with probability 0.05, 0.2, 0.5 |
+    | `rude` | other drivers keep a smaller time gap, brake late and push in | 1, 0.6, 0.3 s; 6, 7, 8 m/s2 |
+    | `polite` | other drivers keep a larger time gap, brake early and let others in | 2, 2.5, 3.5 s; 4, 3, 2 m/s2 |
+
+    The last two are the traffic of `threat.dynamics`, which must be that of the severity (`MANNERS`); nothing else fails.
 
     Args:
         mode: what fails.
@@ -92,9 +110,21 @@ class Fault(DrivingAttack):
 
     @property
     def forges(self) -> tuple[str, ...]:
+        if self.mode in MANNERS:
+            return (" threat.".join(f"dynamics.{name}={value:g}" for name, value in self.manners.items()),)
         return NEEDS.get(self.mode, ())
 
+    @property
+    def manners(self) -> dict[str, float]:
+        """How the traffic drives: fields of `threat.dynamics`; none unless the fault is of other drivers."""
+        return MANNERS[self.mode][self.severity - 1] if self.mode in MANNERS else {}
+
     def initial(self, observation: Tensor, oracle: Oracle) -> State:
+        if wrong := [one for one in self.manners if getattr(oracle.threat.dynamics, one) != self.manners[one]]:
+            raise UserError(
+                f"severity {self.severity} of {self.mode} means threat.dynamics.{wrong[0]}={self.manners[wrong[0]]:g}, the "
+                f"threat model has {getattr(oracle.threat.dynamics, wrong[0]):g}: attack=faults sets it"
+            )
         if self.mode in MEMORYLESS:
             return None
         batch = observation.shape[:1]
@@ -112,6 +142,8 @@ class Fault(DrivingAttack):
         return state
 
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor | Forgery, State]:
+        if self.mode in MANNERS:
+            return observation, None
         if state is None:
             return getattr(self, f"_{self.mode}")(observation, oracle), None
         after = state.clone()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import typing
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from typing import Annotated, Any, get_args, get_origin
 
 WRITTEN = re.compile(r"[a-z0-9_]+(\+[a-z_]+=[a-z_]+|\+[a-z_]+\.[a-z_]+=-?[0-9][0-9.e+-]*)*")
@@ -107,6 +107,21 @@ def read(model: type[Any], given: list[str]) -> dict[str, Any]:
         whole = _types(of(model)[name])[field] is int
         found.setdefault(name, {})[field] = int(text) if whole else float(text)
     return found
+
+
+def widened(threat: Any, given: Mapping[str, float]) -> Any:
+    """The threat model with other values in fields of its sets, by names such as `dynamics.time_gap`.
+
+    Raises:
+        ValueError: if it has no such field, or the value is not allowed.
+    """
+    known = of(type(threat))
+    for key, value in given.items():
+        name, _, field = key.partition(".")
+        if name not in known or field not in _types(known[name]):
+            raise ValueError(f"threat.{key} is unknown")
+        threat = replace(threat, **{name: replace(getattr(threat, name), **{field: value})})
+    return threat
 
 
 def changed(one: Any) -> dict[str, Any]:

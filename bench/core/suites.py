@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from cavbench.core import registry
+from cavbench.core import registry, sets
 from cavbench.core.contracts import Access
 from cavbench.core.pair import Chosen, Pair, choose
 from cavbench.errors import UserError
@@ -30,12 +30,14 @@ class Member:
         attack: its registered name.
         params: its parameters; the others keep their defaults.
         victims: attributes that a victim must have for the member to be meant for it, for instance {"action_type": "discrete"}.
+        threat: what it has in fields of the sets of the threat model, beside what is allowed, such as {"dynamics.time_gap": 0.6}.
         purpose: why it is in the suite.
     """
 
     attack: str
     params: Mapping[str, Any] = field(default_factory=dict)
     victims: Mapping[str, Any] = field(default_factory=dict)
+    threat: Mapping[str, float] = field(default_factory=dict)
     purpose: str = ""
 
     @property
@@ -106,8 +108,9 @@ class Suite:
             if not member.suits(parts["victim"].component):
                 continue
             try:
-                made.append(Pair(attack=member.chosen, **parts))
-            except UserError as error:
+                given = {**parts, "threat": sets.widened(parts["threat"], member.threat)}
+                made.append(Pair(attack=member.chosen, **given))
+            except (UserError, ValueError) as error:
                 skipped.append(f"{self.name} skips {member}: {error}")
         return made, skipped
 
@@ -124,15 +127,19 @@ def suite(name: str, track: str = "") -> Suite:
     Raises:
         UserError: if there is no such suite, or its entry point is not a suite of that name.
     """
-    known = list(registry.entries(registry.SUITES))
     for family in (f"{name}-{track}", name):
-        if versions := [one for one in known if _family(one) == family != one]:
+        if known := _versions(family):
             break
-    newest = max(versions, key=_version, default=name)
+    newest = known[-1] if known else name
     found = registry.resolve(registry.SUITES, newest, "suite")
     if not isinstance(found, Suite) or found.name != newest:
         raise UserError(f"suite {newest!r} is not a cavbench.core.suites.Suite with that name")
     return found
+
+
+def versions(family: str) -> list[Suite]:
+    """Every version of a suite, the oldest first."""
+    return [suite(name) for name in _versions(family)]
 
 
 def allowed(suites: Sequence[Suite]) -> dict[str, Any]:
@@ -182,6 +189,12 @@ def racing(pairs: Sequence[Pair], attacks: Sequence[Chosen[Any]], suites: Sequen
     members = {str(member.chosen) for suite in suites if suite.races for member in suite.members}
     members -= {str(attack) for attack in attacks}
     return frozenset(pair.id for pair in pairs if str(pair.attack) in members)
+
+
+def _versions(family: str) -> list[str]:
+    """The names of all versions of a suite, the oldest first."""
+    known = [one for one in registry.entries(registry.SUITES) if _family(one) == family != one]
+    return sorted(known, key=_version)
 
 
 def _family(name: str) -> str:

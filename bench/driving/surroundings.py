@@ -23,6 +23,7 @@ class Surroundings:
         time_gap: desired time gap, 0.3 to 4 s (IDM T).
         lane_gain: gain of acceleration from which a car changes lane, -2 to 10 m/s2 (MOBIL's threshold).
         imposed_braking: braking that a lane change may impose on the car behind, 0 to 8 m/s2 (MOBIL b_safe).
+        politeness: weight of what a lane change gains and costs the cars behind, 0 to 1 (MOBIL p).
         reaction: time for which a car of the traffic holds its decision, 0 to 2 s; 0 decides in every frame.
         mass: mass of the ego over the nominal one, 0.5 to 3: the same force accelerates and brakes less.
         friction: friction of the road, 0.1 to 1: below 1, the ego neither brakes, accelerates nor turns with more than this times
@@ -38,6 +39,7 @@ class Surroundings:
     time_gap: Annotated[float, Interval(ge=0.3, le=4)] = 1.5
     lane_gain: Annotated[float, Interval(ge=-2, le=10)] = 0.2
     imposed_braking: Annotated[float, Interval(ge=0, le=8)] = 2.0
+    politeness: Annotated[float, Interval(ge=0, le=1)] = 0.0
     reaction: Annotated[float, Interval(ge=0, le=2)] = 0.0
     mass: Annotated[float, Interval(ge=0.5, le=3)] = 1.0
     friction: Annotated[float, Interval(ge=0.1, le=1)] = 1.0

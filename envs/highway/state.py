@@ -97,6 +97,7 @@ class Manners(NamedTuple):
     gap_scale: float  # 2 sqrt(a b)
     lane_gain: float
     imposed_braking: float
+    politeness: float
     hold: int  # frames for which a decision is held; 0 and 1 decide in every frame
 
 
@@ -153,6 +154,7 @@ def manners(surroundings: Surroundings, frequency: int) -> Manners:
         gap_scale=2 * math.sqrt(surroundings.acceleration * surroundings.braking),
         lane_gain=float(surroundings.lane_gain),
         imposed_braking=float(surroundings.imposed_braking),
+        politeness=float(surroundings.politeness),
         hold=round(surroundings.reaction * frequency),
     )
 

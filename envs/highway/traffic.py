@@ -58,27 +58,62 @@ def following_acceleration(vehicles: Vehicles, number: int, leader: int, free: f
 
 
 @inner
+def follower_acceleration(
+    vehicles: Vehicles, number: int, follower: int, leader: int, ego: int, manners: Manners
+) -> float:
+    """What the deciding vehicle thinks that `follower` accelerates behind `leader` (or NO_ONE), in m/s2; 0 without a follower."""
+    if follower < 0:
+        return 0.0
+    target_speed = 0.0 if follower == 0 and ego == CONTINUOUS else vehicles[follower].target_speed
+    free = free_acceleration(vehicles[follower], target_speed, vehicles[number].delta, manners)
+    return following_acceleration(vehicles, follower, leader, free, manners)
+
+
+@inner
+def gain_of_others(
+    vehicles: Vehicles,
+    order: Integers,
+    place: int,
+    lane: int,
+    new_leader: int,
+    own_leader: int,
+    ego: int,
+    manners: Manners,
+) -> float:
+    """What the new and the old follower gain by a change to `lane`, in m/s2: MOBIL weighs it with the politeness."""
+    number = order[place]
+    new, old = rear_vehicle(vehicles, order, place, lane), rear_vehicle(vehicles, order, place, vehicles[number].lane)
+    return (
+        follower_acceleration(vehicles, number, new, number, ego, manners)
+        - follower_acceleration(vehicles, number, new, new_leader, ego, manners)
+        + follower_acceleration(vehicles, number, old, own_leader, ego, manners)
+        - follower_acceleration(vehicles, number, old, number, ego, manners)
+    )
+
+
+@inner
 def wants_lane(
     vehicles: Vehicles, order: Integers, place: int, lane: int, free: float, own_leader: int, ego: int, manners: Manners
 ) -> bool:
     """IDMVehicle.mobil: whether changing to `lane` has a gain and imposes no hard braking on the new follower.
 
-    The two conditions are independent; the cheap one is tested first. Politeness is 0 in highway-env. The follower's
-    acceleration uses the deciding vehicle's IDM exponent; a continuous ego has no target speed, so its target is 0.
+    The two conditions are independent; the cheap one is tested first. The followers' accelerations use the deciding vehicle's
+    IDM exponent; a continuous ego has no target speed, so its target is 0.
     """
     number = order[place]
     new_leader = front_vehicle(vehicles, order, place, lane)
     gain = following_acceleration(vehicles, number, new_leader, free, manners) - following_acceleration(
         vehicles, number, own_leader, free, manners
     )
+    if manners.politeness > 0:
+        gain += manners.politeness * gain_of_others(vehicles, order, place, lane, new_leader, own_leader, ego, manners)
     if gain < manners.lane_gain:
         return False
     follower = rear_vehicle(vehicles, order, place, lane)
     if follower < 0:
         return True
-    target_speed = 0.0 if follower == 0 and ego == CONTINUOUS else vehicles[follower].target_speed
-    imposed = free_acceleration(vehicles[follower], target_speed, vehicles[number].delta, manners)
-    return not imposed - interaction(vehicles[follower], vehicles[number], manners) < -manners.imposed_braking
+    imposed = follower_acceleration(vehicles, number, follower, number, ego, manners)
+    return not imposed < -manners.imposed_braking
 
 
 @inner

@@ -193,6 +193,16 @@ def _scores(track: Track) -> Iterator[Column]:
 
 def _faults() -> Iterator[Column]:
     """What faults without an adversary do to a row; empty where they were not driven."""
+    yield Column(
+        name="faults_suite",
+        title="Suite of faults",
+        short="suite of\nfaults",
+        meaning="the version of the suite of faults that was driven; empty: none of them wholly",
+        value=lambda row, called: (row.faults.suite or None) if row.faults else None,
+        kind="text",
+        optional=True,
+        spare=5,
+    )
     for name, title, short, meaning, kind, digits, spare, value in (
         ("mean", "Faults", "faults\nmean", "mean score under faults without an adversary", "number", 2, 2, "mean"),
         ("worst", "Worst fault", "faults\nworst", "score under the worst of these faults", "number", 2, 4, "worst"),

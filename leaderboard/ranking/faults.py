@@ -12,9 +12,11 @@ from functools import cache
 
 import numpy as np
 
+from cavbench.core import sets, suites
 from cavbench.core.outline import outline
 from cavbench.core.parameters import parameters as declared
 from cavbench.core.registry import Kind
+from cavbench.core.suites import Suite
 from cavbench.leaderboard.comparisons.comparison import Comparison, parameters
 
 FAULT = "fault"
@@ -27,6 +29,7 @@ class FaultRow:
     Args:
         name: defence and victim.
         faults: number of faults.
+        suite: the newest version of the suite of which it has every fault, such as `faults-2`; empty if there is none.
         runs, cells, scenarios: of each fault: training seeds, cells, and scenarios a cell.
         clean, mean, worst: scores without a fault, over all faults, and under the worst.
         crashed, worst_crashed: crash rate over all faults, and under the worst of them.
@@ -36,6 +39,7 @@ class FaultRow:
 
     name: str
     faults: int
+    suite: str
     runs: int
     cells: int
     scenarios: int
@@ -60,6 +64,7 @@ class FaultRow:
         return cls(
             name=victim if defense == "none" else f"{defense} + {victim}",
             faults=len(found),
+            suite=_suite(found),
             runs=len(first.own.runs),
             cells=len(first.cells),
             scenarios=len(first.own.seeds),
@@ -87,8 +92,30 @@ def fault_rows(comparisons: Sequence[Comparison]) -> list[FaultRow]:
     """The rows of all defended victims that faults were driven on, best mean first."""
     groups: dict[tuple[object, ...], list[Comparison]] = {}
     for one in filter(is_fault, comparisons):
-        groups.setdefault((*one.ranked_as, one.identity["threat_norm"], one.identity["grid"]), []).append(one)
+        groups.setdefault((*one.ranked_as, _beside_traffic(one), one.identity["grid"]), []).append(one)
     return sorted(map(FaultRow.of, groups.values()), key=lambda row: -row.mean)
+
+
+def _beside_traffic(one: Comparison) -> tuple[str, ...]:
+    """The sets of its threat model but for `dynamics`, in which the faults of other drivers differ from all others."""
+    norm, words = sets.split(str(one.identity["threat_norm"]))
+    return (norm, *(word for word in words if not word.startswith("dynamics.")))
+
+
+def _suite(found: Sequence[Comparison]) -> str:
+    """The newest suite of faults whose members are all among these."""
+    present = {(one.settings["attack.mode"], one.settings["attack.severity"]) for one in found}
+
+    def whole(suite: Suite) -> bool:
+        return all((member.params["mode"], member.params["severity"]) in present for member in suite.members)
+
+    return next((suite.name for suite in reversed(versions()) if whole(suite)), "")
+
+
+@cache
+def versions() -> tuple[Suite, ...]:
+    """The versions of the suite `faults`, the oldest first."""
+    return tuple(suites.versions("faults"))
 
 
 Faults = Sequence[tuple[Comparison, FaultRow]]
@@ -96,13 +123,16 @@ Faults = Sequence[tuple[Comparison, FaultRow]]
 
 
 def under_faults(comparisons: Sequence[Comparison]) -> Faults:
-    """Of what is ranked, its row under faults: on the grid with the most of them. A row with fewer than another is unfinished."""
+    """Of what is ranked, its row under faults: on the grid with the most of them.
+
+    A row without every fault of a version of the suite is unfinished, and left out if another has more faults.
+    """
     found: dict[tuple[object, ...], list[Comparison]] = {}
     for one in filter(is_fault, comparisons):
         found.setdefault(one.ranked_as, []).append(one)
     rows = [(own[0], max(fault_rows(own), key=lambda row: row.faults)) for own in found.values()]
     most = max((row.faults for _, row in rows), default=0)
-    return [(one, row) for one, row in rows if row.faults == most]
+    return [(one, row) for one, row in rows if row.suite or row.faults == most]
 
 
 def of(one: Comparison, faults: Faults) -> FaultRow | None:

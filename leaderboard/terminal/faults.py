@@ -37,6 +37,7 @@ def faults_report(records: Mapping[str, pa.Table], console: Console) -> None:
     columns: list[Column[FaultRow]] = [
         Column("\ndefended victim", lambda one: one.name, "left", folds=True),
         Column("\nfaults", lambda one: str(one.faults), spare=2),
+        Column("\nsuite", lambda one: one.suite, "left", spare=4),
         Column("\nwithout", lambda one: number(one.clean, 2)),
         Column("\nmean", lambda one: number(one.mean, 2)),
         Column("\nworst", lambda one: number(one.worst, 2)),

@@ -10,7 +10,7 @@ import pytest
 import torch
 from rich.console import Console
 
-from cavbench.attacks.driving.fault import DROPPED, Fault, Mode
+from cavbench.attacks.driving.fault import DROPPED, MANNERS, Fault, Mode
 from cavbench.core import suites
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Job
@@ -63,7 +63,7 @@ def test_a_row_is_missing_as_often_as_the_severity_says() -> None:
     assert abs(share - DROPPED[2]) < 0.01
 
 
-@pytest.mark.parametrize("mode", get_args(Mode))
+@pytest.mark.parametrize("mode", [mode for mode in get_args(Mode) if mode not in MANNERS])
 def test_every_fault_is_used_and_stays_within_its_set(mode: str) -> None:
     found = driven(pair("fault", mode=mode, severity=3))
     assert found["excess_max"].max() < 0.01
@@ -81,10 +81,39 @@ def test_the_same_fault_falls_the_same_in_every_run() -> None:
 
 
 def test_the_suite_allows_what_its_members_need() -> None:
-    suite = suites.suite("faults")
-    assert len(suite.members) == 27
-    words = {word.partition("=")[0] for member in suite.members for word in member.chosen.component.forges}
-    assert words <= suite.threat.keys()
+    old, new = (suites.suite(name) for name in ("faults-1", "faults"))
+    assert (len(old.members), len(new.members)) == (27, 33)
+    assert new.members[:27] == old.members, "the records of version 1 are part of version 2"
+    assert new.threat == old.threat
+    for member in new.members:
+        words = {word.partition("=")[0] for word in member.chosen.component.forges}
+        assert any(word.split()[0] in {*new.threat, *member.threat} for word in words) or not words
+        assert member.threat == {f"dynamics.{name}": value for name, value in member.chosen.component.manners.items()}
+
+
+def test_other_drivers_of_a_fault_drive_otherwise_and_nothing_else_fails() -> None:
+    parts = {"victim": choose("victim", "dqn"), "defense": choose("defense", "none")}
+    made, skipped = suites.suite("faults").pairs(
+        **parts, world=choose("world", "highway", max_steps=60), threat=ObservationThreat(**ALLOWED)
+    )
+    pairs = {(one.attack.component.mode, one.attack.component.severity): one for one in made}
+    assert not skipped
+    assert pairs["late", 1].threat == ObservationThreat(**ALLOWED)
+    usual = driven(made[0].clean())
+    for mode in MANNERS:
+        found = driven(pairs[mode, 3])
+        assert not np.any([found[name] for name in ("linf", "hidden", "invented", "age", "acted")])
+        assert not np.array_equal(found["distance_m"], usual["distance_m"])
+
+
+def test_other_drivers_than_the_severity_says_are_refused() -> None:
+    with pytest.raises(UserError, match=r"allow it threat\.dynamics\.time_gap=0\.6 threat\.dynamics\.braking=7"):
+        pair("fault", mode="rude", severity=2)
+    wrong = pair("fault", allowed={"dynamics": {"time_gap": 2.0}}, mode="rude", severity=2)
+    with pytest.raises(
+        UserError, match=r"severity 2 of rude means threat\.dynamics\.time_gap=0\.6, the threat model has 2"
+    ):
+        driven(wrong)
 
 
 def test_a_fault_that_the_threat_model_leaves_out_is_refused() -> None:

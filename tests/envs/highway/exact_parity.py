@@ -13,8 +13,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cavbench.driving.surroundings import Surroundings
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.config import THESIS_TARGET_SPEEDS, HighwayConfig
+from cavbench.envs.highway.constants import OF_TRAFFIC
 from cavbench.envs.highway.engine import HighwayEngine
 from cavbench.envs.highway.reference import SensedHighwayEnv
 from tests.envs.highway.side_by_side import STATE, Case, Chooser, compare, continuous, differences, discrete, state_of
@@ -73,6 +75,23 @@ SLOW = {
         3, 1, ANY, 24, steps=100, normalize_reward=False, offroad_terminal=False, collision_reward=-5.0
     ),
 }
+
+
+@pytest.mark.parametrize("politeness", [0.4, 1.0])
+def test_traffic_with_other_manners_is_that_of_highway_env(politeness: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    # The reference drives with these constants.
+    for name, value in {
+        "POLITENESS": politeness,
+        "TIME_WANTED": 0.8,
+        "LANE_CHANGE_MIN_ACC_GAIN": 0.1,
+        "LANE_CHANGE_MAX_BRAKING_IMPOSED": 4.0,
+        "COMFORT_ACC_MIN": -3.0,
+    }.items():
+        monkeypatch.setitem(OF_TRAFFIC, name, value)
+    manners = Surroundings(politeness=politeness, time_gap=0.8, lane_gain=0.1, imposed_braking=4.0, braking=3.0)
+    counts = compare(case(4, 2, SOMETIMES, 31, steps=110, surroundings=manners))
+    assert not differences(counts)
+    assert counts["lane changes"] > 0
 
 
 @pytest.mark.parametrize("name", FAST)

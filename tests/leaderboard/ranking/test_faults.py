@@ -12,8 +12,10 @@ from rich.console import Console
 
 from cavbench.api import score
 from cavbench.attacks.driving.fault import Fault
-from cavbench.core import registry
+from cavbench.core import registry, suites
 from cavbench.core.pair import choose
+from cavbench.core.suites import Member
+from cavbench.leaderboard.comparisons.comparison import Comparison
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.ranking.columns import columns
 from cavbench.leaderboard.ranking.faults import is_fault, of, under_faults
@@ -79,6 +81,22 @@ def test_a_row_with_fewer_faults_than_another_is_unfinished(out: Path) -> None:
     other = replace(second, identity={**second.identity, "victim": "ppo"})
     assert [row.faults for _, row in under_faults([first, second])] == [2]
     assert [row.faults for _, row in under_faults([first, second, other])] == [2]
+
+
+def test_a_row_says_which_version_of_the_suite_it_has(out: Path) -> None:
+    one = next(one for one in read_boards(reading.read_all(out))[1] if is_fault(one))
+
+    def like(member: Member, victim: str) -> Comparison:
+        words = "".join(f"+{name}={value:g}" for name, value in member.threat.items())
+        params = json.dumps({"mode": member.params["mode"], "severity": member.params["severity"]})
+        norm = f"{one.identity['threat_norm']}{words}"
+        return replace(one, identity={**one.identity, "attack_params": params, "threat_norm": norm, "victim": victim})
+
+    old = [like(member, "ppo") for member in suites.suite("faults-1").members]
+    new = [like(member, "dqn") for member in suites.suite("faults-2").members]
+    assert {row.suite: row.faults for _, row in under_faults([*old, *new])} == {"faults-1": 27, "faults-2": 33}
+    assert {row.suite for _, row in under_faults([*old, *new[:-1]])} == {"faults-1"}
+    assert [row.suite for _, row in under_faults([*new, *old[:-1]])] == ["faults-2"]
 
 
 def test_records_without_a_newer_parameter_are_of_its_default(out: Path) -> None:
