@@ -41,7 +41,8 @@ def drivers() -> Iterator[tuple[str, str, Mapping[str, object]]]:
     """The victim, the world of its training and its parameters, for each driver."""
     for name in NAMES:
         yield name, "highway", {}
-    for path in sorted(path for root in (zoo.own(), SHIPPED) for path in root.glob("*/seed0.json")):
+    found = {path.parent.name: path for root in (SHIPPED, zoo.own()) for path in sorted(root.glob("*/seed0.json"))}
+    for path in found.values():
         recipe = json.loads(path.read_text())["recipe"]
         victim = recipe.get("victim", {})
         home = victim.get("changed", {}).get("trained_in")
