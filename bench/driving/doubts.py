@@ -34,7 +34,7 @@ def doubts(pair: Pair, default_world: str) -> Iterator[str]:
     for name, part in _named(pair):
         yield from _too_fast(name, part, pair, world)
         if _in_zoo(part, pair):
-            yield from _trained_elsewhere(name, part, world.facts, default_world)
+            yield from _trained_elsewhere(name, part, pair, default_world)
 
 
 def other_features(pair: Pair, default_world: str) -> str:
@@ -89,18 +89,27 @@ def _in_zoo(part: Any, pair: Pair) -> bool:
     """Whether a victim or a defence has networks in the zoo; others may take their networks from anywhere."""
     if not hasattr(part, "trained_in"):
         return False
-    victim: Any = pair.victim.component
     try:
-        return bool(zoo.seeds(zoo.Recipe.of(victim, None if part is victim else part)))
+        return bool(zoo.seeds(_recipe(part, pair)))
     except NotImplementedError:
         return False
 
 
-def _trained_elsewhere(name: str, part: Any, facts: DrivingFacts, default_world: str) -> Iterator[str]:
+def _trained_elsewhere(name: str, part: Any, pair: Pair, default_world: str) -> Iterator[str]:
     """A network of the zoo is at home in the world that its recipe names."""
+    world: Any = pair.world.component
     home = _home(part, default_world)
-    if home is not None and (differs := _difference(home, facts)):
-        yield f"{name} was trained in another world: {differs}; train it in this one (bench train), or choose its own"
+    if home is None or not (differs := _difference(home, world.facts)):
+        return
+    recipe = _recipe(part, pair)
+    found = zoo.trained_there(recipe, where) if (where := zoo.trained_in(world, default=default_world)) else []
+    own = f"choose its own: {found[0]}" if found else "train it in this one (bench train), or choose its own"
+    yield f"{name} was trained in another world: {differs}; {own}"
+
+
+def _recipe(part: Any, pair: Pair) -> zoo.Recipe:
+    victim: Any = pair.victim.component
+    return zoo.Recipe.of(victim, None if part is victim else part)
 
 
 def _home(part: Any, default_world: str) -> DrivingFacts | None:

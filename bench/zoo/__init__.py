@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from cavbench.zoo.homes import trained_there
 from cavbench.zoo.recipe import Recipe, trained_in, written
 from cavbench.zoo.store import card, load, missing, own, own_files, save, seeds, unfinished
 
@@ -15,6 +16,7 @@ __all__ = [
     "save",
     "seeds",
     "trained_in",
+    "trained_there",
     "unfinished",
     "written",
 ]

@@ -277,29 +277,30 @@ def _completed(stored: Mapping[str, Tensor], taken: Sequence[str], start: Networ
 
 
 def _find(recipe: Recipe, seed: int) -> Path:
-    for root in _roots():
+    for root in roots():
         path = root / recipe.key / f"seed{seed}.safetensors"
         if path.exists():
             return path
     raise UserError(missing(recipe, seed))
 
 
-def _roots() -> tuple[Path, Path]:
+def roots() -> tuple[Path, Path]:
+    """The user's zoo, which takes precedence, and the shipped one."""
     return own(), SHIPPED
 
 
 def _seeds(key: str) -> list[int]:
-    files = [path for root in _roots() for path in (root / key).glob("seed*.safetensors")]
+    files = [path for root in roots() for path in (root / key).glob("seed*.safetensors")]
     return sorted({int(path.stem.removeprefix("seed")) for path in files})
 
 
 def _variants(recipe: Recipe) -> Iterator[str]:
     """All recipes of this name in the zoo, with their seeds: `default (seeds 0, 1, 2)`, `victim.hidden=64 (seed 0)`."""
-    keys = {path.name for root in _roots() if root.is_dir() for path in root.iterdir()}
+    keys = {path.name for root in roots() if root.is_dir() for path in root.iterdir()}
     for key in sorted(keys):
         if not re.fullmatch(f"{re.escape(recipe.name)}-[0-9a-f]{{{DIGITS}}}", key):
             continue
-        cards = (root / key / f"seed{seed}.json" for seed in _seeds(key) for root in _roots())
+        cards = (root / key / f"seed{seed}.json" for seed in _seeds(key) for root in roots())
         if (path := next((path for path in cards if path.is_file()), None)) is None:
             continue
         numbers = ", ".join(map(str, _seeds(key)))

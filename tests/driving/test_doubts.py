@@ -20,14 +20,18 @@ FAST = {"target_speeds": (20.0, 25.0, 30.0)}
 
 
 def doubts(
-    victim: str = "dqn", defense: str = "none", world: dict[str, Any] | None = None, **of_victim: Any
+    victim: str = "dqn",
+    defense: str = "none",
+    world: dict[str, Any] | None = None,
+    place: str = "highway",
+    **of_victim: Any,
 ) -> list[str]:
     chosen = choose("victim", victim, **of_victim)
     pair = Pair(
         attack=choose("attack", "none"),
         defense=choose("defense", defense),
         victim=chosen,
-        world=choose("world", "highway", **(world or {})),
+        world=choose("world", place, **(world or {})),
         threat=chosen.component.threat.of_nobody(),
     )
     return list(track("driving").doubts(pair))
@@ -74,6 +78,15 @@ def test_a_network_of_another_world_is_named(world: dict[str, Any], line: str, m
     text = f"[{','.join(map(str, value))}]" if isinstance(value, tuple) else value
     assert doubts("dqn", world=world, trained_in=f"{key}={text}") == []
     assert doubts("dqn", trained_in=f"{key}={text}"), "and the other way round"
+
+
+def test_the_networks_of_the_zoo_that_were_trained_here_are_named() -> None:
+    (said,) = doubts("dqn", place="racetrack")
+    named = said.rpartition("choose its own: ")[2]
+    assert named == "victim.decisions=12000 victim.trained_in=racetrack"
+    assert doubts("dqn", place="racetrack", decisions=12_000, trained_in="racetrack") == []
+    (said,) = doubts("ddpg", place="racetrack")
+    assert said.endswith("train it in this one (bench train), or choose its own")
 
 
 def test_vehicles_on_the_road_are_no_other_world() -> None:

@@ -20,7 +20,8 @@ class Transitions:
     Args:
         observation, action: what was seen [N, V, F] and done [N].
         reward: the n-step return [N].
-        discount: of the value at `after`, 0 after a failure [N].
+        steps: the decisions in it [N].
+        failed: whether it ended in a failure [N].
         after: the last observation of the return [N, V, F].
         allowed, allowed_after: the actions that a defence leaves at both [N, A]; None for all.
     """
@@ -28,21 +29,22 @@ class Transitions:
     observation: Tensor
     action: Tensor
     reward: Tensor
-    discount: Tensor
+    steps: Tensor
+    failed: Tensor
     after: Tensor
     allowed: Tensor | None
     allowed_after: Tensor | None
 
     @classmethod
-    def of(cls, stored: TensorDictBase, gamma: float, mask: str | None) -> Transitions:
-        """The transitions of a buffer, whose discount per decision is `gamma`; `mask` is the key of the allowed actions."""
+    def of(cls, stored: TensorDictBase, mask: str | None) -> Transitions:
+        """The transitions of a buffer, as views; `mask` is the key of the allowed actions."""
         after = stored["next"]
-        going = ~after["terminated"].reshape(-1)
         return cls(
             stored["observation"],
             stored["action"],
             after["reward"].reshape(-1),
-            gamma ** stored["steps_to_next_obs"].reshape(-1) * going,
+            stored["steps_to_next_obs"].reshape(-1),
+            after["terminated"].reshape(-1),
             after["observation"],
             None if mask is None else stored[mask],
             None if mask is None else after[mask],
@@ -74,8 +76,9 @@ class QLearning:
         """Q(s, .) [N, A] of the network in training."""
         return self.network.forward(observation)
 
-    def update(self, batch: Transitions, *, gap: float, rate: float) -> None:
-        """One gradient step; `gap` is that of advantage learning."""
+    def update(self, batch: Transitions, *, gamma: float, gap: float, rate: float) -> None:
+        """One gradient step; `gamma` is the discount of a decision, `gap` that of advantage learning."""
+        discount = gamma**batch.steps * ~batch.failed
         after = self.network.forward(batch.after)
         targets = self.network.forward(batch.after, weights=self.target)
         values = self.network.forward(batch.observation)
@@ -86,7 +89,7 @@ class QLearning:
             targets.numpy(),
             batch.action.numpy(),
             batch.reward.numpy(),
-            batch.discount.numpy(),
+            discount.numpy(),
             gap,
             (every if batch.allowed is None else batch.allowed).numpy(),
             (every if batch.allowed_after is None else batch.allowed_after).numpy(),

@@ -108,12 +108,15 @@ class _Compiled:
 
     def learn(self, stored: TensorDictBase, batch: int, updates: int, rate: float) -> None:
         """Make several updates on random batches of what is `stored`."""
-        transitions = Transitions.of(stored, self.gamma, self.mask)
+        transitions = Transitions.of(stored, self.mask)
         for rows in torch.randint(len(transitions), (updates, batch)):
-            self.learning.update(transitions[rows], gap=self.gap, rate=rate)
+            self._update(transitions[rows], rate)
 
     def update(self, sample: TensorDictBase, rate: float) -> None:
-        self.learning.update(Transitions.of(sample, self.gamma, self.mask), gap=self.gap, rate=rate)
+        self._update(Transitions.of(sample, self.mask), rate)
+
+    def _update(self, batch: Transitions, rate: float) -> None:
+        self.learning.update(batch, gamma=self.gamma, gap=self.gap, rate=rate)
 
     def average(self, policy: QPolicy) -> None:
         self.learning.averaged(policy.network.fused)

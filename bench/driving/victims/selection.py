@@ -19,9 +19,13 @@ from cavbench.scenarios import SeedBlock
 
 @torch.no_grad()
 def selection_score(
-    policy: Policy, world: DrivingWorld, episodes: int, show: Callable[[Tensor, State], Tensor] | None = None
+    policy: Policy,
+    world: DrivingWorld,
+    episodes: int,
+    show: Callable[[Tensor, State], Tensor] | None = None,
+    first: int = SeedBlock.SELECT,
 ) -> dict[str, float]:
-    """Mean `safe_progress` for each road and over all, on the selection seeds, which are never reported.
+    """Mean `safe_progress` for each road and over all, by default on the selection seeds, which are never reported.
 
     Args:
         policy: the policy.
@@ -29,10 +33,11 @@ def selection_score(
         episodes: number of episodes per road.
         show: perturbs the observation [B, V, F] before the policy receives it, and is given the policy's state; None for no
             perturbation.
+        first: the first of the scenario seeds.
     """
     cells = roads(world, episodes)
     env = world.make(cells, action_type=policy.action_type)
-    seeds = torch.arange(SeedBlock.SELECT, SeedBlock.SELECT + episodes).repeat(len(cells) // episodes)
+    seeds = torch.arange(first, first + episodes).repeat(len(cells) // episodes)
     td = env.reset(TensorDict({"seed": seeds}, batch_size=env.batch_size))
     state = policy.initial(torch.arange(len(cells)))
     progress, failed = torch.zeros(len(cells)), torch.zeros(len(cells), dtype=torch.bool)
