@@ -38,7 +38,8 @@ class InWorld:
     @property
     def share(self) -> float | None:
         """The score on the scale of the world: 0 is the best blind policy, 1 is perfect information."""
-        return None if self.parts is None else float(self.parts.mean())
+        # A sum of parts may be below 0 in its last digit.
+        return None if self.parts is None else min(max(float(self.parts.mean()), 0.0), 1.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -121,6 +121,18 @@ def test_a_policy_that_was_trained_in_each_world_is_another_method_than_one_that
     assert [list(row.places) for row in board.rows] == [["highway", "merge"]] * 2
 
 
+def test_a_world_with_its_default_parameters_is_named_without_them() -> None:
+    """Those that it has from a base class, too; otherwise no policy would be at home there."""
+    given = '{"connected": true, "target_speeds": [10.0, 15.0, 20.0, 25.0, 30.0]}'
+    tables = [*attacked("dqn", "merge", 0.5, victim_params={"trained_in": "merge"}), *references("merge")]
+    place = tables[0].schema.get_field_index("world_params")
+    field = tables[0].schema.field(place)
+    tables = [one.set_column(place, field, pa.array([given] * one.num_rows, field.type)) for one in tables]
+    board = worlds(tables, attacked("dqn", "highway", 0.5, victim_params={"trained_in": ""}), references("highway"))
+    assert list(board.grids) == ["highway", "merge"]
+    assert [row.method.home for row in board.rows] == ["each world"]
+
+
 def test_rows_are_told_apart_only_by_a_significant_difference() -> None:
     ends = [references(name) for name in ("merge", "exit")]
     close = worlds(*(attacked(victim, name, 0.5) for victim in ("dqn", "ppo") for name in ("merge", "exit")), *ends)
