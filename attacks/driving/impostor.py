@@ -52,7 +52,7 @@ class Impostor(DrivingAttack):
     made_for: ClassVar[str] = "platoon"
     joint: ClassVar[bool] = True
     needs: ClassVar[tuple[str, ...]] = NEEDED
-    forges: ClassVar[tuple[str, ...]] = VALUES  # type: ignore[misc]
+    forges: ClassVar[tuple[str, ...]] = VALUES
 
     aim: Aim = "closer"
     horizon: Positive = 4.0

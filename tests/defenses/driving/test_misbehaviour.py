@@ -17,9 +17,8 @@ from cavbench.driving.victims.path import PATH
 from cavbench.envs.platoon.axes import CYCLES
 from cavbench.envs.platoon.world import PlatoonWorld
 from cavbench.errors import UserError
-from tests.checks.rules import broken
 
-WORLD = PlatoonWorld(max_steps=300)
+WORLD = PlatoonWorld(max_steps=200)
 LARGE = {"senders": 1, "position": 20.0, "speed": 5.0, "acceleration": 2.0, "delay": 10, "dropped": 0.9}
 
 
@@ -47,7 +46,6 @@ def test_it_keeps_the_rules_with_a_victim_that_listens() -> None:
         one.check: one.text for one in examine("defense", "misbehaviour", {}, victim="cacc") if one.status != "pass"
     }
     assert found == {}
-    assert broken("attack", "false_data") == broken("attack", "impostor") == {}
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.3])
