@@ -187,8 +187,8 @@ class Oracle:
         kept = self._enforcer.forged.past(age)[self._enforcer.rows]
         return kept if self._rows is None else kept[self._rows]
 
-    def left(self, of: Literal["presence", "held"]) -> Tensor:
-        """int64 [B] frames in which cars may still be hidden or invented, or the sensor held."""
+    def left(self, of: Literal["presence", "held", "messages"]) -> Tensor:
+        """int64 [B] frames in which cars may still be hidden or invented, the sensor held, or messages held back."""
         rows = self._enforcer.rows
         return self._enforcer.forged.left(of, rows if self._rows is None else rows[self._rows])
 

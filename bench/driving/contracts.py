@@ -268,6 +268,8 @@ class DrivingAttack(Attack):
     for itself."""
     needs: ClassVar[tuple[str, ...]] = ()
     """Names of the features without which it can do nothing."""
+    made_for: ClassVar[str] = ""
+    """Name of the world that it is checked in, if it is of no use in the usual one."""
     drives: ClassVar[bool] = False
     """Whether it drives cars of the traffic (`Oracle.order`); the threat model must allow it some (`threat.traffic.cars`)."""
 

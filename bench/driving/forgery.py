@@ -27,6 +27,10 @@ class Forgery:
         action: the attacker's action, int64 [B] or float [B, 2], for the NR-MDP and the PR-MDP; -1 or NaN for none.
         shift: [B, 2], added to the controls of a continuous action.
         delay: int64 [B], decisions by which the victim's command is executed late.
+        messages: [B, V, F], false messages in the rows of senders (`Features.messages`), relative to the ego of this frame. NaN
+            leaves a value as it is, and the other rows are never changed.
+        content: int64 [B, V], decisions that the content of these messages is old; `messages` are bounded around it.
+        dropped: bool [B, V], messages that are held back.
     """
 
     observation: Tensor | None = None
@@ -36,6 +40,9 @@ class Forgery:
     action: Tensor | None = None
     shift: Tensor | None = None
     delay: Tensor | None = None
+    messages: Tensor | None = None
+    content: Tensor | None = None
+    dropped: Tensor | None = None
 
 
 def composed(

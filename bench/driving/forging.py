@@ -16,6 +16,7 @@ from torch import Tensor
 from cavbench.driving import invented
 from cavbench.driving.features import ActionType, Features
 from cavbench.driving.forgery import Forgery, composed
+from cavbench.driving.messaging import Messaging
 from cavbench.driving.sets import Actuator
 from cavbench.driving.threat import ObservationThreat, PerturbationSet, bounds
 from cavbench.errors import UserError
@@ -27,16 +28,23 @@ COINS = 0x5DEECE66D
 
 @dataclass(frozen=True, eq=False)
 class Used:
-    """What was used of the sets in a step, int64 [B] each: cars hidden, cars invented, and the age of the frame in decisions."""
+    """What was used of the sets in a step, int64 [B] each.
+
+    Args:
+        hidden, invented: cars.
+        age: of the frame in decisions.
+        messages: senders whose messages were forged, repeated or held back.
+    """
 
     hidden: Tensor
     invented: Tensor
     age: Tensor
+    messages: Tensor
 
     @classmethod
     def nothing(cls, batch: int) -> Used:
         """Nothing in every episode."""
-        return cls(*torch.zeros(3, batch, dtype=torch.int64))
+        return cls(*torch.zeros(4, batch, dtype=torch.int64))
 
 
 class Forging:
@@ -57,6 +65,7 @@ class Forging:
         batch = sum(count for count, _ in parts)
         self.coins = [(count, torch.Generator().manual_seed(seed ^ COINS)) for count, seed in parts]
         self.depth = threat.latency.frames + threat.held.longest
+        self.messaging = Messaging(threat.messages, features, period, steps, batch)
         self.elapsed = -1
         self.truths: list[Tensor] = []
         self.actions: list[Tensor] = []
@@ -75,14 +84,17 @@ class Forging:
             self.truths = [truth.clone(), *self.truths[: self.depth]]
         else:
             self.truths = [truth]
+        self.messaging.see(truth)
         self.answer, self.used, self.before = None, Used.nothing(len(truth)), self.age.clone()
 
     def past(self, age: int) -> Tensor:
         """[B, V, F] the truth of some decisions ago, or the oldest that is kept."""
         return self.truths[min(age, len(self.truths) - 1)]
 
-    def left(self, of: Literal["presence", "held"], rows: Tensor) -> Tensor:
+    def left(self, of: Literal["presence", "held", "messages"], rows: Tensor) -> Tensor:
         """int64 [R] frames that are left of a set's share."""
+        if of == "messages":
+            return self.messaging.left(rows)
         spent = self.forged if of == "presence" else self.held
         return _frames(getattr(self.threat, of).share, self.steps) - spent[rows]
 
@@ -99,6 +111,8 @@ class Forging:
             given = _shaped(forgery.observation, base.shape, "observation", name).to(base.dtype)
             radius = self.threat.radius(base, self.features)
             shown, excess = PerturbationSet(base, radius, *bounds(base, radius)).project(given)
+        shown, told = self._told(forgery, shown, rows, name)
+        excess = torch.maximum(excess, told)
         hidden = self._hidden(forgery, base, rows, name)
         ghosts, beyond = self._invented(forgery, base, rows, name)
         if hidden is not None or ghosts is not None:
@@ -107,6 +121,16 @@ class Forging:
             excess = torch.maximum(excess, beyond)
         self.answer, self.rows = self._commands(forgery, len(rows), name), rows
         return shown, excess
+
+    def _told(self, forgery: Forgery, shown: Tensor, rows: Tensor, name: str) -> tuple[Tensor, Tensor]:
+        """What is shown, with the messages that the attack forged, and how far these had to be moved for that [R]."""
+        if not self.messaging.allowed:
+            if forgery.messages is not None or forgery.content is not None or forgery.dropped is not None:
+                raise UserError(f"{name} forged messages, the threat model allows none (threat.messages.senders)")
+            return shown, shown.new_zeros(len(rows))
+        told, excess, used = self.messaging.tell(forgery, shown, self.age[rows], rows, name)
+        self.used.messages[rows] = used
+        return told, excess
 
     def close(self, truth: Tensor, attacked: Tensor) -> None:
         """End the showing of a step.
@@ -117,6 +141,7 @@ class Forging:
         """
         others = torch.ones(len(truth), dtype=torch.bool)
         others[attacked] = False
+        self.messaging.close(truth, others)
         self.age[others] = 0
         self.repeats[others] = 0
         if self.ghosts is not None:

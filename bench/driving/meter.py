@@ -37,7 +37,7 @@ class Meter:
         forges: whether the threat model allows more than changed values.
     """
 
-    FORGED = ("hidden", "invented", "age", "acted")
+    FORGED = ("hidden", "invented", "age", "acted", "false_messages")
     SUMS = ("steps", "return", "progress", "mean_speed", "changed", "linf", "l2", "linf_m", "linf_mps", "attack_ms")
 
     def __init__(self, subject: CountedPolicy, facts: DrivingFacts, start_x: Tensor, *, forges: bool = False) -> None:
@@ -120,7 +120,7 @@ class Meter:
         if used is None:
             return
         acted = executed is not action and (executed != action).reshape(len(action), -1).any(1).numpy()
-        counted = (used.hidden.numpy(), used.invented.numpy(), used.age.numpy(), acted)
+        counted = (used.hidden.numpy(), used.invented.numpy(), used.age.numpy(), acted, used.messages.numpy())
         self.used += np.where(driven.numpy(), np.stack(np.broadcast_arrays(*counted)), 0.0)
 
     def _changed(self, truth: Tensor, action: Tensor, state: State, touched: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -234,7 +234,9 @@ def _traced(
     """The values of one step that a recording needs."""
     names = ("progress", "speed", "x", "ttc", "crashed", "offroad")
     used = shown.used
-    forged = {} if used is None else {"hidden": used.hidden, "invented": used.invented, "age": used.age}
+    forged = {}
+    if used is not None:
+        forged = {"hidden": used.hidden, "invented": used.invented, "age": used.age, "false_messages": used.messages}
     return {
         "observation": truth,
         "perturbed": shown.observation,

@@ -95,6 +95,36 @@ class Actuator:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Messages:
+    """Messages of other cars that the attacker sends in their name, holds back, or repeats (V2X).
+
+    It owns the senders themselves, their keys included: a false message is as fresh and as well signed as a true one. Which they
+    are it decides when it first forges; an owned one stays owned to the end of the episode. It cannot send what the radio loses.
+
+    Args:
+        senders: number of cars whose messages it may forge in an episode.
+        position, speed, acceleration: largest differences to the true message in m, m/s and m/s2.
+        delay: largest age of the content of a message, in decisions; it is told as fresh.
+        dropped: share of the frames of a full episode in which messages may be held back, rounded down.
+    """
+
+    senders: Cars = 0
+    position: Annotated[float, Interval(ge=0, le=400)] = 0.0
+    speed: Annotated[float, Interval(ge=0, le=50)] = 0.0
+    acceleration: Annotated[float, Interval(ge=0, le=20)] = 0.0
+    delay: Frames = 0
+    dropped: Share = 0.0
+
+    def __post_init__(self) -> None:
+        ranges.check(self)
+        given = changed(self)
+        if given and not self.senders:
+            raise ValueError("senders is 0, so the attacker owns nobody: give senders, too")
+        if given.keys() == {"senders"}:
+            raise ValueError("senders alone allows nothing: give position, speed, acceleration, delay or dropped, too")
+
+
+@dataclass(frozen=True, kw_only=True)
 class Traffic:
     """Cars of the traffic that the attacker drives, within bounds that a careless driver keeps; the world enforces them.
 

@@ -17,7 +17,7 @@ from cavbench.core.contracts import ThreatModel
 from cavbench.core.ranges import Natural, Share
 from cavbench.driving.features import Features
 from cavbench.driving.invented import NEEDED
-from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
+from cavbench.driving.sets import Actuator, Held, Latency, Messages, Presence, Traffic
 from cavbench.driving.surroundings import Surroundings
 
 Norm = Literal["relative", "linf"]
@@ -40,8 +40,9 @@ class ObservationThreat(ThreatModel):
         actuator: how late and how far off commands may be executed.
         traffic: cars of the traffic that the attacker drives.
         dynamics: how the traffic drives and what the ego weighs, of which the victim is not told.
+        messages: messages of other cars that the attacker forges.
 
-    The last six are empty by default, and combine (`cavbench.driving.sets`). `fixed` features of the world cannot be changed.
+    The last seven are empty by default, and combine (`cavbench.driving.sets`). `fixed` features of the world cannot be changed.
     Values are clipped to [-1, 1], the range of every sensor. Without the set `presence` no row comes or goes.
     """
 
@@ -55,6 +56,7 @@ class ObservationThreat(ThreatModel):
     actuator: Actuator = field(default_factory=Actuator)
     traffic: Traffic = field(default_factory=Traffic)
     dynamics: Surroundings = field(default_factory=Surroundings)
+    messages: Messages = field(default_factory=Messages)
 
     def slip(self) -> str:
         if self.norm != "relative" or self.budget < 1:
@@ -112,7 +114,13 @@ class ObservationThreat(ThreatModel):
             features: names and ranges of the measured features.
             steps: decisions of a full episode.
         """
-        if any((self.presence != Presence(), self.latency != Latency(), self.held != Held())):
+        others = (
+            self.presence != Presence(),
+            self.latency != Latency(),
+            self.held != Held(),
+            self.messages != Messages(),
+        )
+        if any(others):
             # Another frame, or another car, may be anything.
             return 2 * math.sqrt(rows * (1 + len(features.names)) * self.frames(steps))
         extremes = torch.ones(rows, 1 + len(features.names)) * torch.tensor([1.0, -1.0])[:, None, None]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavbench.core import sets
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Baseline, Certified, Contrast, Driven, Job, Measure, Track
-from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
+from cavbench.driving.sets import Actuator, Held, Latency, Messages, Presence, Traffic
 from cavbench.driving.surroundings import Surroundings
 from cavbench.errors import UserError
 from cavbench.records.schema import FLOAT, NAN_GRADIENTS, PROBES, field
@@ -149,6 +149,17 @@ FORGED = (
 )
 """What was used of the sets beside changed values."""
 
+TOLD = (
+    field(
+        "false_messages",
+        FLOAT,
+        "senders whose messages were forged, repeated or held back, mean over the steps; null as `hidden`",
+        "senders",
+        nullable=True,
+        low=0,
+    ),
+)
+
 BLAME: tuple[pa.Field, ...] = (
     field(
         "avoidable",
@@ -226,7 +237,7 @@ class DrivingTrack(Track):
         *BLAME,
         *STRINGS,
     )
-    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME, *STRINGS))
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME, *STRINGS, *TOLD))
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     sets: ClassVar[Mapping[str, type[Any]]] = {
         "presence": Presence,
@@ -235,6 +246,7 @@ class DrivingTrack(Track):
         "actuator": Actuator,
         "traffic": Traffic,
         "dynamics": Surroundings,
+        "messages": Messages,
     }
     metric: ClassVar[str] = "safe_progress"
     metric_title: ClassVar[str] = "safe progress"

@@ -10,7 +10,7 @@ from annotated_types import Interval
 
 from cavbench.core.parameters import differing
 from cavbench.core.ranges import Natural, NotNegative
-from cavbench.driving import Control, Driver, DrivingFacts, DrivingWorld, Features
+from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Features
 from cavbench.driving.features import LaneShape
 from cavbench.driving.platooning import Platooning
 from cavbench.envs.platoon.axes import AXES, LAST_PLACE, PLATOON_V1
@@ -108,6 +108,12 @@ class PlatoonWorld(DrivingWorld):
             driver=control.driver,
             action_repeat=control.action_repeat,
         )
+
+    def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics:
+        """See `cavbench.driving.DrivingWorld.dynamics`: the cars ahead keep their command for a second."""
+        from cavbench.envs.platoon.forecast import PlatoonDynamics
+
+        return PlatoonDynamics(len(cells), self.observed_rows, self.features, action_type)
 
     def build(self, cells: Sequence[Cell], control: Control) -> EnvBase:
         """See `cavbench.driving.DrivingWorld.build`."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from tests.checks.rules import broken, built_in, each
 
-DEFENSES = built_in("defense")
+OWN_TESTS = {"misbehaviour"}
+"""Defences for victims that listen to other cars, which the usual victim does not."""
+DEFENSES = built_in("defense").keys() - OWN_TESTS
 
 
-@each(DEFENSES)
+@each(sorted(DEFENSES))
 def test_it_keeps_the_rules(name: str) -> None:
     assert broken("defense", name) == {}
