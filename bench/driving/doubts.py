@@ -136,8 +136,8 @@ def _difference(home: DrivingFacts, here: DrivingFacts) -> str:
         return f"it decided {home.decision_hz:g} times a second, here it does {here.decision_hz:g} times"
     speeds = [None if facts.kinematics is None else facts.kinematics.target_speeds for facts in (home, here)]
     if speeds[0] != speeds[1]:
-        told = [", ".join(f"{speed:g}" for speed in each or ()) for each in speeds]
-        return f"its target speeds were {told[0]} m/s, here they are {told[1]} m/s"
+        before, now = (each and f"{', '.join(f'{speed:g}' for speed in each)} m/s" for each in speeds)
+        return f"its target speeds were {before or 'not declared'}, here they are {now or 'not declared'}"
     return ""
 
 

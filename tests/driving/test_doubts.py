@@ -80,6 +80,11 @@ def test_a_network_of_another_world_is_named(world: dict[str, Any], line: str, m
     assert doubts("dqn", trained_in=f"{key}={text}"), "and the other way round"
 
 
+def test_a_world_that_declares_no_target_speeds_says_so() -> None:
+    (said,) = doubts("dqn", place="two_way")
+    assert "its target speeds were 10, 15, 20, 25, 30 m/s, here they are not declared" in said
+
+
 def test_the_networks_of_the_zoo_that_were_trained_here_are_named() -> None:
     (said,) = doubts("dqn", place="racetrack")
     named = said.rpartition("choose its own: ")[2]
