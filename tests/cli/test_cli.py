@@ -65,7 +65,7 @@ def test_a_components_page_fits_a_terminal_of_80_columns(
 
 
 def test_an_unknown_component_has_no_page(bench: Bench) -> None:
-    assert_one_line(bench("list", "nugde"), "unknown component 'nugde'; did you mean 'nudge'?", "known: advtrain")
+    assert_one_line(bench("list", "nugde"), "unknown component 'nugde'; did you mean 'nudge'?", "known: acc, advtrain")
 
 
 @pytest.mark.parametrize(
