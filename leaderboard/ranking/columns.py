@@ -196,12 +196,11 @@ def _faults() -> Iterator[Column]:
     yield Column(
         name="faults_suite",
         title="Suite of faults",
-        short="suite of\nfaults",
         meaning="the version of the suite of faults that was driven; empty: none of them wholly",
         value=lambda row, called: (row.faults.suite or None) if row.faults else None,
         kind="text",
+        shown=False,
         optional=True,
-        spare=5,
     )
     for name, title, short, meaning, kind, digits, spare, value in (
         ("mean", "Faults", "faults\nmean", "mean score under faults without an adversary", "number", 2, 2, "mean"),
