@@ -236,6 +236,7 @@ class DrivingTrack(Track):
         *FORGED,
         *BLAME,
         *STRINGS,
+        *TOLD,
     )
     later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME, *STRINGS, *TOLD))
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
