@@ -84,11 +84,16 @@ class Wanted:
 
     def drive(self) -> bool:
         """Drive and publish it; whether that went well."""
-        command = [sys.executable, "-m", "cavbench", "run", *ALWAYS, *self.words, f"out={self.folder}", "--yes"]
-        if subprocess.run(command, stdout=subprocess.DEVNULL).returncode:
+        if not driven([*ALWAYS, *self.words, f"out={self.folder}"]):
             return False
         publish(self.folder, self.home, add=True)
         return True
+
+
+def driven(words: Sequence[str]) -> bool:
+    """Drive a run in a process of its own; whether that went well."""
+    command = [sys.executable, "-m", "cavbench", "run", *words, "--yes"]
+    return subprocess.run(command, stdout=subprocess.DEVNULL).returncode == 0
 
 
 def wanted_rows(home: Path, out: Path) -> list[Wanted]:

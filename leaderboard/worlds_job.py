@@ -9,7 +9,6 @@ What is driven is kept in a results folder: a job that was killed goes on where 
 from __future__ import annotations
 
 import argparse
-import subprocess
 import sys
 import tomllib
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from cavbench.leaderboard.job import driven
 from cavbench.leaderboard.published import HOME, publish_worlds
 from cavbench.run.config import plan_of
 from cavbench.run.cost import spoken
@@ -62,8 +62,7 @@ def main(words: Sequence[str] | None = None) -> int:
             if left < 0:
                 console.print("the other runs do not fit in the hours that are left")
                 break
-            command = [sys.executable, "-m", "cavbench", "run", *own, *ALWAYS, f"out={given.out}", "--yes"]
-            failed += subprocess.run(command, stdout=subprocess.DEVNULL).returncode != 0
+            failed += not driven([*own, *ALWAYS, f"out={given.out}"])
         for name, episodes in publish_worlds(given.out, home).items():
             console.print(f"{name}: {episodes} episodes")
     return int(failed > 0)

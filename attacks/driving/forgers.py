@@ -29,8 +29,33 @@ GAP = 15.0
 """Distance of an invented car to the ego along the road, in m."""
 
 
+class Chooser(DrivingAttack):
+    """Chooses one of a few numbered lies by a rehearsal, and keeps it for a while."""
+
+    access: ClassVar[Access] = "dynamics"
+    joint: ClassVar[bool] = True
+
+    @abstractmethod
+    def worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
+        """The number of the worst lie [B], int64."""
+
+    def initial(self, observation: Tensor, oracle: Oracle) -> State:
+        state = oracle.dynamics.unknown()
+        state["time"], state["which"] = torch.zeros(2, len(state), dtype=torch.int64)
+        return state
+
+    def believed(self, observation: Tensor, oracle: Oracle, state: TensorDict, renew: int) -> TensorDict:
+        """What is believed of the cars, with the number `which` of the lie, chosen anew every `renew` decisions."""
+        belief = oracle.dynamics.believe(observation, state)
+        belief["time"], belief["which"] = state["time"] + 1, state["which"]
+        # All episodes of a step have the same age.
+        if int(state["time"][0]) % renew == 0:
+            belief["which"] = self.worst(belief, oracle)
+        return belief
+
+
 @dataclass(frozen=True, kw_only=True)
-class Forger(DrivingAttack):
+class Forger(Chooser):
     """The search that they share; a forgery has a number, and number 0 is none.
 
     Args:
@@ -40,9 +65,7 @@ class Forger(DrivingAttack):
         worth: what a forgery must take to be used where frames are limited, in decisions of full progress (default 5).
     """
 
-    access: ClassVar[Access] = "dynamics"
     needs: ClassVar[tuple[str, ...]] = NEEDED
-    joint: ClassVar[bool] = True
     moves: ClassVar[bool] = False
     """Whether a change to another forgery takes a frame without one."""
 
@@ -76,20 +99,11 @@ class Forger(DrivingAttack):
         """int64 [B] frames that are left; None if every frame may be forged."""
         return None
 
-    def initial(self, observation: Tensor, oracle: Oracle) -> State:
-        state = oracle.dynamics.unknown()
-        state["time"], state["which"] = torch.zeros(2, len(state), dtype=torch.int64)
-        return state
-
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor | Forgery, State]:
         assert state is not None
         if not len(observation) or self.options(oracle) < 2:
             return observation, state
-        belief = oracle.dynamics.believe(observation, state)
-        belief["time"], belief["which"] = state["time"] + 1, state["which"]
-        # All episodes of a step have the same age.
-        if int(state["time"][0]) % self.renew == 0:
-            belief["which"] = self._worst(belief, oracle)
+        belief = self.believed(observation, oracle, state, self.renew)
         left = self.limited(oracle)
         which = belief["which"] if left is None else torch.where(left > 0, belief["which"], 0)
         if self.moves:
@@ -99,7 +113,7 @@ class Forger(DrivingAttack):
         _, forgery = self.forged(observation, past, which, oracle)
         return observation if forgery is None else forgery, belief
 
-    def _worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
+    def worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
         """The number of the worst forgery [B]; the present one if no other is worse by more than `KEEPING`."""
         copies = self.options(oracle)
         # A rehearsal has its own draws of a random victim.

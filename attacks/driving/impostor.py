@@ -10,9 +10,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.attacks.driving.false_data import NEEDED, VALUES, Aim, nearest, offsets
-from cavbench.core.contracts import Access
+from cavbench.attacks.driving.forgers import Chooser
 from cavbench.core.ranges import Count, Positive
-from cavbench.driving import DrivingAttack, Forgery, Oracle, State
+from cavbench.driving import Forgery, Oracle, State
 
 LIES = torch.tensor(
     [
@@ -32,7 +32,7 @@ KEEPING = 1e-3
 
 
 @dataclass(frozen=True, kw_only=True)
-class Impostor(DrivingAttack):
+class Impostor(Chooser):
     """Simulates the next seconds with a copy of the victim under seven lies of the nearest senders, and tells the worst one.
 
     White box with access `dynamics`. The cars ahead are simulated from their true messages, with their present command for a
@@ -48,9 +48,7 @@ class Impostor(DrivingAttack):
     default). With a smaller query budget it looks less far ahead.
     """
 
-    access: ClassVar[Access] = "dynamics"
     made_for: ClassVar[str] = "platoon"
-    joint: ClassVar[bool] = True
     needs: ClassVar[tuple[str, ...]] = NEEDED
     forges: ClassVar[tuple[str, ...]] = VALUES
 
@@ -58,25 +56,14 @@ class Impostor(DrivingAttack):
     horizon: Positive = 4.0
     renew: Count = 5
 
-    def initial(self, observation: Tensor, oracle: Oracle) -> State:
-        state = oracle.dynamics.unknown()
-        state["time"], state["which"] = torch.zeros(2, len(state), dtype=torch.int64)
-        return state
-
     def step(self, observation: Tensor, oracle: Oracle, state: State) -> tuple[Tensor | Forgery, State]:
         assert state is not None
-        if not len(observation):
+        if not len(observation) or not oracle.threat.messages.senders:
             return observation, state
-        belief = oracle.dynamics.believe(observation, state)
-        belief["time"], belief["which"] = state["time"] + 1, state["which"]
-        if not oracle.threat.messages.senders:
-            return observation, belief
-        # All episodes of a step have the same age.
-        if int(state["time"][0]) % self.renew == 0:
-            belief["which"] = self._worst(belief, observation, oracle)
+        belief = self.believed(observation, oracle, state, self.renew)
         return Forgery(messages=_told(observation, belief["which"], oracle)), belief
 
-    def _worst(self, belief: TensorDict, observation: Tensor, oracle: Oracle) -> Tensor:
+    def worst(self, belief: TensorDict, oracle: Oracle) -> Tensor:
         """The number of the worst lie [B], int64."""
         copies = len(LIES)
         affordable = int(oracle.remaining.min()) * oracle.draws // copies

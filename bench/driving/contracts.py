@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar
 from torch import Tensor
 
 from cavbench.core.contracts import Attack, Defense, Progress, ThreatModel, Trained, Victim, World
+from cavbench.core.parameters import differing
 from cavbench.driving.access import Oracle
 from cavbench.driving.blame import Deeds
 from cavbench.driving.dynamics import Dynamics
@@ -41,6 +42,8 @@ class DrivingWorld(World):
     """
 
     track: ClassVar[str] = "driving"
+    name: ClassVar[str]
+    """Its name on the command line and in `cavbench.gym.make`. Only `gym_call` needs it."""
     features: ClassVar[Features]
     actions: ClassVar[tuple[str, ...]]
     """Names of the discrete actions, by number."""
@@ -84,6 +87,12 @@ class DrivingWorld(World):
             kinematics=self.kinematics,
             rows=self.observed_rows,
         )
+
+    @property
+    def gym_call(self) -> str:
+        """What makes a gymnasium environment of it, as a user types it."""
+        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
+        return f'cavbench.gym.make("{self.name}"{options})'
 
     def facts_at(self, cell: Cell) -> DrivingFacts:
         """The facts in a cell, where they depend on it. Cells with different facts are driven in different batches."""

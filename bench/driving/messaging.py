@@ -126,12 +126,7 @@ class Messaging:
         """int64 [R, V] how old the content of each message is."""
         if forgery.content is None:
             return torch.zeros(shown.shape[:2], dtype=torch.int64)
-        content = forgery.content.detach()
-        if content.shape != shown.shape[:2] or content.dtype != torch.int64:
-            raise UserError(
-                f"{name} answered content as {content.dtype} of shape {list(content.shape)}, not torch.int64 of shape "
-                f"{list(shown.shape[:2])}"
-            )
+        content = _answered(forgery.content, torch.int64, shown, f"{name} answered content")
         if len(content) and (int(content.min()) < 0 or int(content.max()) > self.threat.delay):
             raise UserError(
                 f"{name} repeated a message after {int(content.max())} decisions, the threat model allows 0 to "
@@ -145,12 +140,7 @@ class Messaging:
         """bool [R, V] which messages are held back."""
         if forgery.dropped is None:
             return torch.zeros(shown.shape[:2], dtype=torch.bool)
-        dropped = forgery.dropped.detach()
-        if dropped.shape != shown.shape[:2] or dropped.dtype != torch.bool:
-            raise UserError(
-                f"{name} answered dropped as {dropped.dtype} of shape {list(dropped.shape)}, not torch.bool"
-            )
-        dropped = dropped.clone()
+        dropped = _answered(forgery.dropped, torch.bool, shown, f"{name} answered dropped").clone()
         dropped[:, : self.first] = False
         self.drops[rows] += dropped.any(1)
         if bool((self.drops[rows] > self.most).any()):
@@ -214,3 +204,16 @@ class Messaging:
     def _speed(self, observation: Tensor) -> Tensor:
         """[B] speed of the ego in m/s."""
         return observation[:, 0, self.columns[1]] * self.half[1]
+
+
+def _answered(given: Tensor, dtype: torch.dtype, shown: Tensor, what: str) -> Tensor:
+    """One value for each row of the observations `shown` [R, V, F].
+
+    Raises:
+        UserError: if it has another type or shape; the line begins with `what`.
+    """
+    if given.shape != shown.shape[:2] or given.dtype != dtype:
+        raise UserError(
+            f"{what} as {given.dtype} of shape {list(given.shape)}, not {dtype} of shape {list(shown.shape[:2])}"
+        )
+    return given.detach()

@@ -217,6 +217,9 @@ STRINGS: tuple[pa.Field, ...] = (
 )
 """What a car in a platoon does to those behind it."""
 
+LATER = (*ALARMS, *FORGED, *BLAME, *STRINGS, *TOLD)
+"""Columns that older records lack. New ones come last: a record has its columns in this order."""
+
 
 class DrivingTrack(Track):
     """Driving policies on a road, attacked through their observations, ranked by `safe_progress`."""
@@ -232,13 +235,9 @@ class DrivingTrack(Track):
         ASSURED,
         SHIFT,
         NAN_GRADIENTS,
-        *ALARMS,
-        *FORGED,
-        *BLAME,
-        *STRINGS,
-        *TOLD,
+        *LATER,
     )
-    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*ALARMS, *FORGED, *BLAME, *STRINGS, *TOLD))
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in LATER)
     norms: ClassVar[tuple[str, ...]] = ("relative", "linf")
     sets: ClassVar[Mapping[str, type[Any]]] = {
         "presence": Presence,

@@ -94,11 +94,10 @@ class Checked(PolicyWrapper):
         seen[..., platooning.senders] = observation[..., platooning.radar, 0] > 0
         return speeds.masked_fill(~seen, torch.nan), ax.masked_fill(~new, torch.nan)
 
-    def _level(self, observation: Tensor, state: State) -> Tensor:
-        """The suspicion [B]."""
+    def _level(self, observation: Tensor, state: State, speeds: Tensor, told: Tensor) -> Tensor:
+        """The suspicion [B], from what was measured."""
         assert state is not None
         settings, platooning = self.settings, self.rows.platooning
-        speeds, told = self._measured(observation)
         x, vx, _ = self.rows.physical(observation)
         radar, ahead = platooning.radar, platooning.senders
         both = told[..., ahead].isfinite() & speeds[..., ahead].isfinite()
@@ -116,7 +115,7 @@ class Checked(PolicyWrapper):
         return torch.stack((place, speed, off.amax(-1), silent)).amax(0)
 
     def suspicion(self, observation: Tensor, state: State) -> Suspicion:
-        level = self._level(observation, state)
+        level = self._level(observation, state, *self._measured(observation))
         return Suspicion(level, level >= 1)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
@@ -124,7 +123,7 @@ class Checked(PolicyWrapper):
         scores = self.policy.scores(observation, state.get("inner", None))
         if self.settings.fallback == "none":
             return scores
-        taken_over = (state["left"] > 0) | (self._level(observation, state) >= 1)
+        taken_over = (state["left"] > 0) | (self._level(observation, state, *self._measured(observation)) >= 1)
         return torch.where(taken_over.unsqueeze(-1), self.fallback.scores(observation, state["fallback"]), scores)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
@@ -136,7 +135,7 @@ class Checked(PolicyWrapper):
         own = {
             "speeds": torch.cat((state["speeds"][:, 1:], speeds.nan_to_num(MISSING)[:, None]), 1),
             "told": torch.cat((state["told"][:, 1:], told.nan_to_num(MISSING)[:, None]), 1),
-            "left": torch.where(self._level(observation, state) >= 1, self.settings.hold_s, left),
+            "left": torch.where(self._level(observation, state, speeds, told) >= 1, self.settings.hold_s, left),
             "fallback": fallback,
         }
         return with_inner(own, self.policy.advance(observation, action, state.get("inner", None)), state.batch_size)

@@ -14,15 +14,13 @@ from matplotlib.lines import Line2D
 from cavbench.core.track import track
 from cavbench.leaderboard.published import published
 from cavbench.leaderboard.ranking.boards import Row, read_boards
-from cavbench.leaderboard.ranking.faults import FAULT
+from cavbench.statistics.estimates import Interval
 from docs.figures import style
+from docs.figures.leaderboard import plain_name, point
 
 GRIDS = {"driving": "standard-v2", "detection": "approach-v1"}
 GROWING = (("noise",), ("noise", "zo"), ("noise", "zo", "pgd"), ("noise", "zo", "pgd", "plan"), ())
 """Sets of attacks, each with one more. The last one is all."""
-NOT_ATTACKS = ["none", FAULT]
-Point = tuple[float, float, float]
-"""A value and its interval."""
 
 
 def attacks() -> Figure:
@@ -35,17 +33,17 @@ def attacks() -> Figure:
     for names in GROWING:
         kept = ["none", *names] if names else driven
         row = _rows("driving", records.filter(pc.is_in(records["attack"], pa.array(kept))))[0]
-        points[f"+ {names[-1]}" if names[1:] else (names[0] if names else "whole suite")] = _strongest(row)
+        points[f"+ {names[-1]}" if names[1:] else (names[0] if names else "whole suite")] = row.worst.score
     made = style.figure(2.5, "What is left of dqn + advtrain under more attacks")
     axes = made.subplots()
-    _dots(axes, [(name, {style.SHOWN: point}) for name, point in points.items()])
+    _dots(axes, [(name, {style.SHOWN: score}) for name, score in points.items()])
     axes.set(xlim=(0, 1), xlabel="safe progress under the strongest of them")
     return made
 
 
 def filters() -> Figure:
     """Networks alone and behind filters."""
-    rows = {_name(row): row for row in _rows("driving", _of("driving"))}
+    rows = {plain_name(row): row for row in _rows("driving", _of("driving"))}
     names = [one + behind for one in ("dqn", "ppo", "sac") for behind in ("", " + tracker+shield")]
     made = style.figure(2.9, "The filter matters more than the network")
     axes = made.subplots()
@@ -57,13 +55,13 @@ def filters() -> Figure:
 
 def faults() -> Figure:
     """Crashes of five drivers under attacks on the whole grid, and under faults on one road."""
-    rows = {_name(row): row for row in _rows("driving", published(track("driving")))}
+    rows = {plain_name(row): row for row in _rows("driving", published(track("driving")))}
     lines = []
     for name in ("planner + tracker", "dqn + tracker+shield", "planner", "dqn + shield", "dqn + advtrain"):
         row = rows[name]
         assert row.faults is not None
         crashed = {style.SHOWN: float(row.worst.failed.mean()), style.FAULT: row.faults.crashed}
-        lines.append((name, {colour: (share, share, share) for colour, share in crashed.items()}))
+        lines.append((name, {colour: Interval(share, share, share) for colour, share in crashed.items()}))
     made = style.figure(2.5, "Who withstands lies may fail under faults")
     axes = made.subplots()
     _dots(axes, lines)
@@ -74,7 +72,7 @@ def faults() -> Figure:
 
 def trainings() -> Figure:
     """The ten trainings of four drivers, each under the strongest attack."""
-    rows = {_name(row): row for row in _rows("driving", _of("driving"))}
+    rows = {plain_name(row): row for row in _rows("driving", _of("driving"))}
     made = style.figure(2.2, "Ten trainings of one recipe")
     axes = made.subplots()
     names = ["dqn", "ddpg", "dqn + advtrain", "dqn + tracker+shield"]
@@ -88,7 +86,7 @@ def trainings() -> Figure:
 
 def detectors() -> Figure:
     """Four detectors, alone and hardened."""
-    rows = {_name(row): row for row in _rows("detection", _of("detection"))}
+    rows = {plain_name(row): row for row in _rows("detection", _of("detection"))}
     names = [one for one in rows if "+" not in one or one.endswith("advtrain")]
     made = style.figure(2.9, "Adversarial training holds")
     axes = made.subplots()
@@ -100,30 +98,28 @@ def detectors() -> Figure:
 
 def patches() -> Figure:
     """What one detector keeps under each attack alone, without a defence and hardened."""
-    rows = {_name(row): row for row in _rows("detection", _of("detection"))}
-    kept: dict[str, dict[str, Point]] = {}
+    rows = {plain_name(row): row for row in _rows("detection", _of("detection"))}
+    kept: dict[str, dict[str, Interval]] = {}
     for colour, row in (
         (style.UNDEFENDED, rows["yolov3_tiny"]),
         (style.HARDENED, rows["yolov3_tiny + advtrain"]),
     ):
         for one in row.attacks:
             points = kept.setdefault(str(one.identity["attack"]), {})
-            found = one.score.estimate, one.score.low, one.score.high
-            points[colour] = min(points.get(colour, found), found)
+            points[colour] = min(points.get(colour, one.score), one.score, key=lambda found: found.estimate)
     made = style.figure(2.6, "What each patch leaves of yolov3_tiny")
     axes = made.subplots()
-    _dots(axes, sorted(kept.items(), key=lambda item: -item[1][style.HARDENED][0]))
+    _dots(axes, sorted(kept.items(), key=lambda item: -item[1][style.HARDENED].estimate))
     axes.set(xlim=(0, 1), xlabel="stop score")
     _legend(made, {"undefended": style.UNDEFENDED, "hardened": style.HARDENED})
     return made
 
 
-def _dots(axes: Axes, lines: Sequence[tuple[str, Mapping[str, Point]]]) -> None:
+def _dots(axes: Axes, lines: Sequence[tuple[str, Mapping[str, Interval]]]) -> None:
     """A line for each name, with points of a colour and their intervals."""
     for place, (_, points) in enumerate(lines):
-        for colour, (value, low, high) in points.items():
-            axes.plot([low, high], [place, place], color=colour, lw=2.2, clip_on=False)
-            axes.plot(value, place, "o", color=colour, ms=7, mec="none", clip_on=False)
+        for colour, found in points.items():
+            point(axes, found, place, colour)
     _named(axes, [name for name, _ in lines])
 
 
@@ -140,11 +136,6 @@ def _legend(made: Figure, colours: Mapping[str, str]) -> None:
     made.legend(handles, list(colours), loc="outside lower center", ncols=2, handletextpad=0.1)
 
 
-def _name(row: Row) -> str:
-    victim, defense = (str(row.identity[name]) for name in ("victim", "defense"))
-    return victim if defense == "none" else f"{victim} + {defense.removesuffix('_detection')}"
-
-
 def _of(name: str) -> pa.Table:
     records = published(track(name))
     return records.filter(pc.equal(records["grid"], GRIDS[name]))
@@ -159,12 +150,6 @@ def _rows(name: str, records: pa.Table) -> Sequence[Row]:
     return max(boards, key=lambda board: len(board.rows)).rows
 
 
-def _strongest(row: Row) -> Point:
-    found = row.worst.score
-    return found.estimate, found.low, found.high
-
-
-def _both(row: Row) -> dict[str, Point]:
-    clean = row.worst.clean
-    assert clean is not None
-    return {style.TRUE: (clean.estimate, clean.low, clean.high), style.SHOWN: _strongest(row)}
+def _both(row: Row) -> dict[str, Interval]:
+    assert row.worst.clean is not None
+    return {style.TRUE: row.worst.clean, style.SHOWN: row.worst.score}

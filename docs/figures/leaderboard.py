@@ -47,8 +47,8 @@ def _draw(axes: Axes, board: Board) -> None:
         worst = row.worst.score
         if row.worst.clean:
             axes.plot([worst.estimate, row.worst.clean.estimate], [place, place], color=style.FAINT, lw=5, zorder=1)
-            _point(axes, row.worst.clean, place, style.TRUE, opacity)
-        _point(axes, worst, place, style.SHOWN, opacity)
+            point(axes, row.worst.clean, place, style.TRUE, opacity)
+        point(axes, worst, place, style.SHOWN, opacity)
         if np.isfinite(row.worst.rival).all():
             blind = share_interval(row.worst.rival[None]).estimate
             axes.plot(blind, place, "|", color=style.INK, ms=13, mew=1.8)
@@ -68,13 +68,18 @@ def _draw(axes: Axes, board: Board) -> None:
     axes.set_title(f"{board.track.name}, {norm} {budget:g}{flagged}", fontsize=10.5)
 
 
-def _point(axes: Axes, found: Interval, place: int, colour: str, opacity: float) -> None:
+def point(axes: Axes, found: Interval, place: int, colour: str, opacity: float = 1) -> None:
+    """An estimate with its interval, on the line `place`."""
     axes.plot([found.low, found.high], [place, place], color=colour, lw=2.2, alpha=opacity, clip_on=False)
     axes.plot(found.estimate, place, "o", color=colour, ms=7, alpha=opacity, mec="none", clip_on=False)
 
 
+def plain_name(row: Row) -> str:
+    """Victim and defence."""
+    victim, defense = (str(row.identity[name]) for name in ("victim", "defense"))
+    return victim if defense == "none" else f"{victim} + {defense.removesuffix('_detection')}"
+
+
 def _name(row: Row, *, said: bool) -> str:
     """Victim and defence; and that the row is flagged, if that is not said of all."""
-    victim, defense = (str(row.identity[name]) for name in ("victim", "defense"))
-    plain = victim if defense == "none" else f"{victim} + {defense.removesuffix('_detection')}"
-    return f"{plain} (flagged)" if row.flagged and not said else plain
+    return f"{plain_name(row)} (flagged)" if row.flagged and not said else plain_name(row)

@@ -215,13 +215,15 @@ class BankScenes(Scenes):
         for place, (number, (x, y)) in enumerate(zip(numbers, corners.tolist(), strict=True)):
             plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
             picture = plate.cut(window)
-            patched = common(window, plate.crop, _reach(self.poses[number], share, self.mount))
-            if beside:
-                assert patches is not None
-                (spot,) = self.mount.spots(share)
-                picture = plate.beside(picture, window, patches[place % len(patches)], spot)
-            elif patches is not None and patched:
-                picture[within(patched, window)] = plate.signed(faces[_kind(plate)][place % len(patches)], patched)
+            reach = _reach(self.poses[number], share, self.mount)
+            patched = common(window, reach) if beside else common(window, plate.crop, reach)
+            if patches is not None and patched:
+                patch, where = place % len(patches), within(patched, window)
+                if beside:
+                    (spot,) = self.mount.spots(share)
+                    picture[where] = plate.beside(picture[where], patched, patches[patch], spot)
+                else:
+                    picture[where] = plate.signed(faces[_kind(plate)][patch], patched)
             shown.append(picture)
         return shown
 

@@ -93,47 +93,33 @@ class Plate:
         filled = without_sign(self.picture.permute(1, 2, 0).numpy(), self.crop, self.lit.numpy(), self.post)
         return develop.light_of(torch.from_numpy(filled).permute(2, 0, 1) / 255)
 
-    def beside(self, picture: Tensor, window: Box, patch: Tensor, spot: Spot) -> Tensor:
-        """A window of the image with a patch on a plate of its own, in the plane of the sign; differentiable in the patch.
+    def beside(self, shown: Tensor, part: Box, patch: Tensor, spot: Spot) -> Tensor:
+        """A part of the image with a patch on a plate of its own, in the plane of the sign; differentiable in the patch.
 
         What the frame does not hold is taken from the sign: the plate is lit and dimmed as the sign is on the whole, and nothing
         stands before it.
 
         Args:
-            picture: float32 [3, h, w] without the plate.
-            window: its box in the image.
+            shown: the part without the plate, float32 [3, h, w].
+            part: its box in the image.
             patch: sRGB in [0, 1], [3, P, P].
             spot: where the plate is in texture coordinates of the sign.
         """
         if not self.lit.any():
-            return picture
-        place, inside = on_square(window, self.face_from_pixel, spot)
-        rows, columns = (np.flatnonzero(inside.any(axes)) for axes in ((1, 2, 3), (0, 1, 3)))
-        if not len(rows):
-            return picture
-        down, across = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        samples = [slice(part.start * SUPERSAMPLING, part.stop * SUPERSAMPLING) for part in (down, across)]
-        inside = inside[down, :, across]
-        side = max(1, round((spot[2] - spot[0]) * detail(self.crop)))
+            return shown
+        left, top, right, bottom = spot
+        corner, sides = np.array([left, top], np.float32), np.array([right - left, bottom - top], np.float32)
+        place = (_sampled(part, self.face_from_pixel) - corner) / sides
+        inside = torch.from_numpy(((place >= 0) & (place <= 1)).all(-1)).float()
+        side = max(1, round((right - left) * detail(self.crop)))
         # As many texels as the face of the sign would have there: fewer are means, more are copies.
         mode = "area" if side < patch.shape[-1] else "nearest-exact"
-        texels = torch.nn.functional.interpolate(linear(patch)[None], size=(side, side), mode=mode)
-        found = torch.nn.functional.grid_sample(
-            texels,
-            torch.from_numpy(2 * place[samples[0], samples[1]] - 1)[None],
-            mode="bilinear",
-            padding_mode="border",
-            align_corners=False,
-        )
-        weight = torch.from_numpy(inside.reshape(found.shape[-2:]).astype(np.float32))
-        seen = torch.nn.functional.avg_pool2d(found * weight, SUPERSAMPLING)[0]
-        cover = torch.nn.functional.avg_pool2d(weight[None], SUPERSAMPLING)
-        black, gain = (part[:, self.lit].median(1).values[:, None, None] for part in (self.black, self.gain))
-        behind = develop.light_of(picture[:, down, across])
+        texels = torch.nn.functional.interpolate(linear(patch)[None], size=(side, side), mode=mode)[0]
+        cover = torch.nn.functional.avg_pool2d(inside[None], SUPERSAMPLING)
+        black, gain = (light[:, self.lit].median(1).values[:, None, None] for light in (self.black, self.gain))
         printed = torch.tensor(self.printed).view(3, 1, 1)
-        shown = picture.clone()
-        shown[:, down, across] = develop.tone(cover * black + gain * printed * seen + (1 - cover) * behind)
-        return shown
+        light = cover * black + gain * printed * _mean_at(texels, place, inside)
+        return torch.where(cover > 0, develop.tone(light + (1 - cover) * develop.light_of(shown)), shown)
 
     def cut(self, part: Box) -> Tensor:
         """A part of the image with the plain sign, float32 [3, h, w]."""
@@ -179,23 +165,25 @@ def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
     cover = inside.mean((1, 3), np.float32, keepdims=True)
     # Where the tracer saw a corner of the sign but no sample hits it, the border texel is used.
     weight = np.where(cover > 0, inside / np.maximum(cover, 1e-6), np.float32(1)).reshape(place.shape[:2])
+    return _mean_at(face, place, torch.from_numpy(weight))
+
+
+def _mean_at(texels: Tensor, place: NDArray[np.float32], weight: Tensor) -> Tensor:
+    """Weighted mean of texels [3, S, S] over the samples of each pixel, [3, h, w].
+
+    Args:
+        texels: of a unit square.
+        place: where the samples are on it, [h * SUPERSAMPLING, w * SUPERSAMPLING, 2].
+        weight: of the samples, [h * SUPERSAMPLING, w * SUPERSAMPLING].
+    """
     found = torch.nn.functional.grid_sample(
-        face.unsqueeze(0),
+        texels.unsqueeze(0),
         torch.from_numpy(2 * place - 1).unsqueeze(0),
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
     )
-    return torch.nn.functional.avg_pool2d(found * torch.from_numpy(weight), SUPERSAMPLING)[0]
-
-
-def on_square(part: Box, face_from_pixel: Array, spot: Spot) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Where the samples of pixels are on a square beside or on the sign [h * S, w * S, 2], and whether inside [h, S, w, S]."""
-    left, top, right, bottom = spot
-    sides = np.array([right - left, bottom - top], np.float32)
-    place = (_sampled(part, face_from_pixel) - np.array([left, top], np.float32)) / sides
-    inside = ((place >= 0) & (place <= 1)).all(-1)
-    return place, inside.reshape(part[3] - part[1], SUPERSAMPLING, part[2] - part[0], SUPERSAMPLING)
+    return torch.nn.functional.avg_pool2d(found * weight, SUPERSAMPLING)[0]
 
 
 def wholly_sign(part: Box, face_from_pixel: Array) -> Tensor:

@@ -8,7 +8,6 @@ from dataclasses import replace
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
-from cavbench.core.parameters import differing
 from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Kinematics
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, HighwayConfig
@@ -39,8 +38,6 @@ class StraightRoad(DrivingWorld):
     axes: ClassVar[Axes] = AXES
     actions: ClassVar[tuple[str, ...]] = ACTIONS
     drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "clairvoyant")
-    name: ClassVar[str]
-    """Its name on the command line."""
     home: ClassVar[Cell] = AXES.cell(lanes=3, density=1.0)
     """The cell that stands for the world where none is chosen."""
     offers: ClassVar[tuple[str, ...]] = (*DrivingWorld.offers, "traffic", "dynamics")
@@ -74,8 +71,7 @@ class StraightRoad(DrivingWorld):
 
     @property
     def facts(self) -> DrivingFacts:
-        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
-        return replace(super().facts, environment=f'cavbench.gym.make("{self.name}"{options})')
+        return replace(super().facts, environment=self.gym_call)
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
         """Whether the traffic leaves a way through.

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from annotated_types import Interval
 
-from cavbench.core.parameters import differing
 from cavbench.core.ranges import Natural, NotNegative
 from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Features
 from cavbench.driving.features import LaneShape
@@ -82,13 +81,12 @@ class PlatoonWorld(DrivingWorld):
 
     @property
     def facts(self) -> DrivingFacts:
-        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
         return replace(
             super().facts,
             controls=("acceleration",),
             platooning=PLATOONING,
             lanes=(LANE,),
-            environment=f'cavbench.gym.make("{self.name}"{options})',
+            environment=self.gym_call,
         )
 
     def configuration(self, cells: Sequence[Cell], control: Control | None = None) -> PlatoonConfig:

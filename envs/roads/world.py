@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from cavbench.core.parameters import differing
 from cavbench.driving import Control, Driver, DrivingFacts, DrivingWorld, Features, Kinematics
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS
 from cavbench.envs.roads.config import RoadsConfig, Scene
@@ -44,8 +43,6 @@ class RoadsWorld(DrivingWorld):
     features: ClassVar[Features] = STANDARD_FEATURES
     actions: ClassVar[tuple[str, ...]] = ACTIONS
     drivers: ClassVar[tuple[Driver, ...]] = ("agent", "idm", "clairvoyant")
-    name: ClassVar[str]
-    """The name of the world on the command line and in `cavbench.gym.make`."""
     home: ClassVar[Cell]
     """A cell of this world, for checks that do not depend on it."""
     rules: ClassVar[Mapping[str, Any]]
@@ -98,8 +95,7 @@ class RoadsWorld(DrivingWorld):
 
     @property
     def facts(self) -> DrivingFacts:
-        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
-        return replace(super().facts, environment=f'cavbench.gym.make("{self.name}"{options})')
+        return replace(super().facts, environment=self.gym_call)
 
     def facts_at(self, cell: Cell) -> DrivingFacts:
         """The facts in a cell: with the lanes of its road."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from cavbench.core.parameters import differing
 from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
 from cavbench.driving.kinematics import CarFollowing
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS, HighwayConfig
@@ -91,8 +90,7 @@ class SumoWorld(DrivingWorld):
 
     @property
     def facts(self) -> DrivingFacts:
-        options = "".join(f", {name}={value!r}" for name, value in differing(self).items())
-        return replace(super().facts, environment=f'cavbench.gym.make("{self.name}"{options})')
+        return replace(super().facts, environment=self.gym_call)
 
     def configuration(self, cells: Sequence[Cell], control: Control | None = None) -> HighwayConfig:
         """The configuration of the code of `highway` that moves the ego; arguments as in `DrivingWorld.build`."""

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 
-from cavbench.core.outline import outline
-from cavbench.core.parameters import parameters as declared
 from cavbench.core.registry import Kind
 from cavbench.leaderboard.comparisons.comparison import parameters
 from cavbench.leaderboard.comparisons.typed import typed
@@ -102,15 +99,7 @@ def _home(text: str, default: str) -> str:
 def _part(kind: Kind, name: str, params: object) -> Part:
     """A component with the parameters that are no defaults; a victim without its home."""
     values = {key: _plain(value) for key, value in typed(kind, name, parameters(params)).items() if key != HOME}
-    defaults = _defaults(kind, name)
-    return name, tuple((key, value) for key, value in sorted(values.items()) if value not in ("", defaults.get(key)))
-
-
-@cache
-def _defaults(kind: Kind, name: str) -> dict[str, str]:
-    """The defaults of a component, those of its base classes too; nothing is imported to know them."""
-    found = outline(kind, name)
-    return {} if found is None else {key: _plain(one.default) for key, one in declared(found).items()}
+    return name, tuple((key, value) for key, value in sorted(values.items()) if value)
 
 
 def _titles(parts: Sequence[Part]) -> dict[Part, str]:

@@ -227,7 +227,9 @@ def _row(
             # Its score there is not one under attack. NaN, which is no 0, where records do not count queries.
             lacks[name] = f"no attack that it met in all of its worlds asked it anything ({', '.join(sorted(common))})"
         elif place.parts is None:
-            lacks[name] = "its references were driven on other scenarios"
+            lacks[name] = (
+                "there is no scale on its scenarios: references lack some, or perfect information is no better"
+            )
     found = WorldRow(method, places, lacks, tuple(sorted(common)))
     if lacks or not counted:
         return found

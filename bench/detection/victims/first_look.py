@@ -38,11 +38,9 @@ def look(victim: Foreign, detector: FileDetector) -> Tensor | None:
     pictures = torch.rand(3, 3, SIDE, SIDE, generator=torch.Generator().manual_seed(0))
     pictures[1], pictures[2] = 1.0, 0.5
     with torch.no_grad():
-        shapes = [one.shape for one in detector.outputs_for(pictures[:1])]
-        if not detector.names:
-            detector.names = layout.named(shapes)
-        elif victim.activation == "softmax":
-            detector.names = layout.with_no_object(detector.names, shapes)
+        if not detector.names or victim.activation == "softmax":
+            shapes = [one.shape for one in detector.outputs_for(pictures[:1])]
+            detector.names = layout.with_no_object(detector.names, shapes) if detector.names else layout.named(shapes)
         alone, grey, together = detector.raw(pictures[:1]), detector.raw(pictures[2:]), detector.raw(pictures)
     boxes, objectness, classes, *_ = together
     path, tolerance = detector.path, TOLERANCE[detector.given.dtype]

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 import torch
 from annotated_types import Interval
 from torch import Tensor
 
 from cavbench.core.ranges import NotNegative
-from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from cavbench.driving.victims.platoon_rows import Follower
+from cavbench.driving import DrivingFacts, Policy, State
+from cavbench.driving.victims.platoon_rows import Follower, PlatoonVictim
 
 Headway = Annotated[float, Interval(ge=0.1, le=5)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CACC(DrivingVictim):
+class CACC(PlatoonVictim):
     """Keeps a constant time gap, and does what the car ahead says that it is doing (Ploeg et al. 2011, section III).
 
     The command of the car ahead, as its last message has it, is added to a proportional and derivative control of the gap. It
@@ -30,27 +30,17 @@ class CACC(DrivingVictim):
         ranging: where gap and closing speed are from: the own `radar`, or the `messages` of the car ahead.
     """
 
-    made_for: ClassVar[str] = "platoon"
-
     headway: Headway = 0.7
     kp: NotNegative = 0.2
     kd: NotNegative = 0.7
     ranging: Literal["radar", "messages"] = "radar"
-
-    @property
-    def action_type(self) -> ActionType:
-        return "continuous"
-
-    @property
-    def draws(self) -> bool:
-        return False
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return Cooperative(self, facts).eval()
 
 
 @dataclass(frozen=True, kw_only=True)
-class ACC(DrivingVictim):
+class ACC(PlatoonVictim):
     """Adaptive cruise control: the controller of `cacc` with the radar alone, and no message.
 
     At low frequencies it is string stable from a headway of sqrt(2 / kp) on: 1.41 s here, and 3.16 s with the gains of `cacc`.
@@ -60,19 +50,9 @@ class ACC(DrivingVictim):
         kp, kd: gains in 1/s2 and 1/s.
     """
 
-    made_for: ClassVar[str] = "platoon"
-
     headway: Headway = 1.5
     kp: NotNegative = 1.0
     kd: NotNegative = 1.4
-
-    @property
-    def action_type(self) -> ActionType:
-        return "continuous"
-
-    @property
-    def draws(self) -> bool:
-        return False
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return Cooperative(self, facts).eval()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 import torch
 from annotated_types import Interval
@@ -12,12 +12,12 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.core.ranges import Positive
-from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
-from cavbench.driving.victims.platoon_rows import Follower
+from cavbench.driving import DrivingFacts, Policy, State
+from cavbench.driving.victims.platoon_rows import Follower, PlatoonVictim
 
 
 @dataclass(frozen=True, kw_only=True)
-class PATH(DrivingVictim):
+class PATH(PlatoonVictim):
     """Keeps a constant distance, whatever the speed, by messages of the car ahead and of the leader (Rajamani 2012, section 7.6).
 
     A constant distance is string stable only with what the leader says (Swaroop and Hedrick 1996). Without a message for a second
@@ -30,20 +30,10 @@ class PATH(DrivingVictim):
         bandwidth: omega_n in 1/s.
     """
 
-    made_for: ClassVar[str] = "platoon"
-
     gap: Positive = 8.0
     c1: Annotated[float, Interval(gt=0, lt=1)] = 0.5
     damping: Annotated[float, Interval(ge=1, le=10)] = 1.0
     bandwidth: Positive = 0.2
-
-    @property
-    def action_type(self) -> ActionType:
-        return "continuous"
-
-    @property
-    def draws(self) -> bool:
-        return False
 
     def load(self, seed: int, facts: DrivingFacts) -> Policy:
         return LeaderFollower(self, facts).eval()

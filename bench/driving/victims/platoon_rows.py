@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cavbench.driving import DrivingFacts, Policy, State
+from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.platooning import Platooning
 from cavbench.errors import UserError
 
@@ -59,6 +59,20 @@ class Rows:
             torch.where(first.there, first.closing, second.closing),
             first.there | second.there,
         )
+
+
+class PlatoonVictim(DrivingVictim):
+    """A controller by rule of a car in a platoon."""
+
+    made_for: ClassVar[str] = "platoon"
+
+    @property
+    def action_type(self) -> ActionType:
+        return "continuous"
+
+    @property
+    def draws(self) -> bool:
+        return False
 
 
 class Follower(Policy):
