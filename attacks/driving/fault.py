@@ -12,6 +12,7 @@ from torch import Tensor
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Natural
 from cavbench.driving import DrivingAttack, Forgery
+from cavbench.driving.invented import NEEDED
 from cavbench.errors import UserError
 
 if TYPE_CHECKING:
@@ -256,7 +257,7 @@ def _placed(place: Tensor, observation: Tensor, features: Features) -> Tensor:
 def _moved(cars: Tensor, before: Tensor, ego: Tensor, oracle: Oracle) -> Tensor:
     """The cars [B, K, F] one decision later, at the same speeds on the road; the ego's row [B, F] before and now."""
     features = oracle.features
-    at = [features.names.index(name) for name in ("x", "y", "vx", "vy")]
+    at = [features.names.index(name) for name in NEEDED]
     physical, gained = features.physical(cars)[..., at], (features.physical(ego) - features.physical(before))[:, at]
     physical[..., :2] += oracle.period * (physical[..., 2:] - gained[:, None, 2:] / 2)
     physical[..., 2:] -= gained[:, None, 2:]
@@ -265,10 +266,9 @@ def _moved(cars: Tensor, before: Tensor, ego: Tensor, oracle: Oracle) -> Tensor:
 
 def _rows(physical: Tensor, features: Features, like: Tensor) -> Tensor:
     """Rows [..., F] of cars with x, y, vx, vy in physical units; other features are 0."""
-    low, high = torch.tensor(features.low), torch.tensor(features.high)
-    rows = torch.zeros(*physical.shape[:-1], like.shape[-1])
-    for place, name in enumerate(("x", "y", "vx", "vy")):
-        at = features.names.index(name)
-        rows[..., 1 + at] = 2 * (physical[..., place] - low[at]) / (high[at] - low[at]) - 1
+    at = [features.names.index(name) for name in NEEDED]
+    values, rows = torch.zeros(2, *physical.shape[:-1], like.shape[-1])
+    values[..., [1 + one for one in at]] = physical
+    rows[..., [1 + one for one in at]] = features.normalised(values[..., 1:])[..., at]
     rows[..., 0] = 1.0
     return rows.clamp(-1.0, 1.0)

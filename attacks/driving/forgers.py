@@ -303,7 +303,6 @@ def invented(observation: Tensor, which: Tensor, features: Features, most: int) 
     """
     x, y, vx, vy = (features.names.index(name) for name in NEEDED)
     ego = features.physical(observation[..., 0, :])
-    low, high = torch.tensor(features.low), torch.tensor(features.high)
     cars = observation.new_zeros(*which.shape, most, observation.shape[-1])
     table = torch.tensor(PLACES)
     for car in range(most):
@@ -312,6 +311,6 @@ def invented(observation: Tensor, which: Tensor, features: Features, most: int) 
         physical = torch.zeros(*which.shape, len(features.names))
         physical[..., x], physical[..., y] = ahead * GAP, centre - ego[..., y]
         physical[..., vx], physical[..., vy] = 0.0, -ego[..., vy]
-        cars[..., car, 1:] = (2 * (physical - low) / (high - low) - 1).clamp(-1.0, 1.0)
+        cars[..., car, 1:] = features.normalised(physical).clamp(-1.0, 1.0)
         cars[..., car, 0] = (which > 0).to(cars)
     return cars.masked_fill((cars[..., :1] <= 0), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import torch
@@ -93,6 +94,11 @@ class Features:
         if strange := [name for name in self.fixed if name not in self.names]:
             raise ValueError(f"features.fixed names {strange[0]!r}, which is not one of features.names")
 
+    @cached_property
+    def _ends(self) -> tuple[Tensor, Tensor]:
+        """[F - 1] ends of the ranges. Every copy of the features has tensors of its own: nobody writes to those of another."""
+        return torch.tensor(self.low), torch.tensor(self.high)
+
     def forgeable(self) -> Tensor:
         """[F - 1] 1 for the features that an attack may change, 0 for those that are `fixed`."""
         return torch.tensor([float(name not in self.fixed) for name in self.names])
@@ -109,12 +115,18 @@ class Features:
 
     def half_range(self) -> Tensor:
         """[F - 1] size of one normalised unit, in physical units."""
-        return (torch.tensor(self.high) - torch.tensor(self.low)) / 2
+        low, high = self._ends
+        return (high - low) / 2
 
     def physical(self, observation: Tensor) -> Tensor:
         """[..., V, F - 1] the measured values of an observation [..., V, F], in physical units."""
-        low, high = torch.tensor(self.low).to(observation), torch.tensor(self.high).to(observation)
+        low, high = (end.to(observation) for end in self._ends)
         return (high + low) / 2 + observation[..., 1:] * (high - low) / 2
+
+    def normalised(self, physical: Tensor) -> Tensor:
+        """[..., F - 1] values in physical units on the scale of observations: -1 and 1 are the ends of a range, not clipped."""
+        low, high = (end.to(physical) for end in self._ends)
+        return 2 * (physical - low) / (high - low) - 1
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -52,8 +52,8 @@ def plausible(
         reached = past[..., at] + period * ((moving + earlier) - (ego_speed + ego_earlier)) / 2
         placed = torch.where(lasting, now[..., at].clamp(reached - TOLERANCE, reached + TOLERANCE), now[..., at])
         now[..., rate], now[..., at] = moving - ego_speed, placed
-    low, high = torch.tensor(features.low).to(now), torch.tensor(features.high).to(now)
-    rows = torch.cat((torch.ones_like(now[..., :1]), 2 * (now - low) / (high - low) - 1), -1).clamp(-1.0, 1.0)
+    rows = torch.cat((torch.ones_like(now[..., :1]), features.normalised(now)), -1).clamp(-1.0, 1.0)
     # A car that has left the sensor's range is not there any more.
+    low, high = (torch.tensor(end).to(now) for end in (features.low, features.high))
     outside = (now < low - TOLERANCE).any(-1) | (now > high + TOLERANCE).any(-1)
     return rows.masked_fill(~(there & ~outside)[..., None], 0.0)

@@ -160,9 +160,7 @@ class Form:
         values = self.values.float().unsqueeze(0) if self.single else self.values.float()
         if not self.native:
             return values.contiguous()
-        features = self.facts.features
-        low, high = torch.tensor(features.low), torch.tensor(features.high)
-        measured = (2 * (values.flatten(1) - low) / (high - low) - 1).clamp(-1, 1)
+        measured = self.facts.features.normalised(values.flatten(1)).clamp(-1, 1)
         return torch.cat((torch.ones(len(values), 1), measured), -1).unsqueeze(1)
 
     def back(self, observation: Tensor, truth: Tensor) -> Any:

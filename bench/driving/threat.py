@@ -81,11 +81,9 @@ class ObservationThreat(ThreatModel):
         if self.norm == "linf":
             bound = torch.full_like(measured, budget)
         else:
-            half_range = features.half_range().to(measured)
-            centre = (torch.tensor(features.low) + torch.tensor(features.high)).to(measured) / 2
             floor = torch.tensor(features.floors or (0.0,)).to(measured) * (budget / 0.1)
-            physical = measured * half_range + centre
-            bound = torch.maximum(budget * physical.abs(), floor) / half_range
+            furthest = torch.maximum(budget * features.physical(observation).abs(), floor)
+            bound = furthest / features.half_range().to(measured)
         bound = bound * (observation[..., :1] > 0)
         if features.fixed:
             bound = bound * features.forgeable().to(bound)

@@ -84,8 +84,7 @@ class Assumed:
 
     def normalised(self, values: Tensor) -> Tensor:
         """Physical values of the measured features [..., F - 1] on the scale of observations, clipped to [-1, 1]."""
-        low, high = (torch.tensor(bound).to(values) for bound in (self.features.low, self.features.high))
-        return ((values - low) / (high - low) * 2 - 1).clamp(-1, 1)
+        return self.features.normalised(values).clamp(-1, 1)
 
 
 class _Boxes(torch.autograd.Function):
