@@ -1,8 +1,8 @@
-"""Measures how many decisions a CPU second the world `sumo` makes, SUMO's own processes included:
+"""Measures how many decisions a CPU second the worlds in SUMO's traffic make, its own processes included:
 
-    python benchmarks/sumo_speed.py [--batch 16] [--seconds 5] [--lanes 3] [--density 1] [--vehicles 20]
+    python benchmarks/sumo_speed.py [--crossing] [--batch 16] [--seconds 5] [--lanes 2] [--density 1] [--vehicles 20]
 
-Whole episodes of a car that keeps its lane and speed, or of the rule-based driver, resets included; a finished episode starts
+With `--crossing` it is `sumo_crossing`. Whole episodes of a car that keeps its lane and speed, or of the rule-based driver, resets included; a finished episode starts
 again at once. Compilation and the start of SUMO are not counted. It needs `pip install 'cavbench[sumo]'`.
 """
 
@@ -21,7 +21,7 @@ from rich.console import Console
 from cavbench.driving import Control, Driver
 from cavbench.envs.highway.config import ACTIONS
 from cavbench.envs.highway.engine import Flag
-from cavbench.envs.sumo.axes import SUMO
+from cavbench.envs.sumo.crossing_world import SumoCrossingWorld
 from cavbench.envs.sumo.engine import SumoEngine
 from cavbench.envs.sumo.world import SumoWorld
 
@@ -57,17 +57,20 @@ def rates(engine: SumoEngine, seconds: float) -> tuple[float, float, float]:
 def main() -> None:
     """Measure, and print a line for each driver."""
     parser = argparse.ArgumentParser(description="Decisions a CPU second in SUMO's traffic.")
+    parser.add_argument("--crossing", action="store_true")
     parser.add_argument("--batch", type=int, default=16)
     parser.add_argument("--seconds", type=float, default=5.0)
-    parser.add_argument("--lanes", type=int, default=3)
+    parser.add_argument("--lanes", type=int, default=2)
     parser.add_argument("--density", type=float, default=1.0)
     parser.add_argument("--vehicles", type=int, default=20)
     parser.add_argument("--processes", type=int, default=1)
     options = parser.parse_args()
-    world = SumoWorld(vehicles=options.vehicles)
-    cells = (SUMO.cell(lanes=options.lanes, density=options.density),) * options.batch
+    world = (SumoCrossingWorld if options.crossing else SumoWorld)(vehicles=options.vehicles)
+    cells = (
+        world.axes.cell(**dict(world.home) | {"lanes": options.lanes, "density": options.density}),
+    ) * options.batch
     for driver in DRIVERS:
-        engine = SumoEngine(world.configuration(cells, Control(driver=driver)), options.processes)
+        engine = SumoEngine(world.configuration(cells, Control(driver=driver)), world.scene(), options.processes)
         rate, share, clock = rates(engine, options.seconds)
         engine.processes.close()
         Console().print(

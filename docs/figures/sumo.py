@@ -29,7 +29,7 @@ def sumo() -> Figure:
     cell = SumoWorld().axes.cell(lanes=LANES, density=2.0)
     made = style.figure(4.6, f"sumo: lanes {LANES}, density 2")
     every = made.subplots(len(MOMENTS) + 1, 1)
-    engine = SumoEngine(SumoWorld().configuration((cell,), Control(driver="idm")))
+    engine = SumoEngine(SumoWorld().configuration((cell,), Control(driver="idm")), SumoWorld().scene())
     engine.reset(np.array([0]), np.array([SEED]))
     for axes, moment in zip(every[:-1], MOMENTS, strict=True):
         while engine.episodes["steps"][0] < moment:
@@ -44,7 +44,7 @@ def sumo() -> Figure:
 
 def crash(axes: Axes, cell: object) -> None:
     """The ego steers to the left until its body overlaps another one."""
-    engine = SumoEngine(SumoWorld().configuration((cell,), Control(action_type="continuous")))  # type: ignore[arg-type]
+    engine = SumoEngine(SumoWorld().configuration((cell,), Control(action_type="continuous")), SumoWorld().scene())  # type: ignore[arg-type]
     engine.reset(np.array([0]), np.array([SEED]))
     other = engine.vehicles[0, int(np.argmin(np.abs(engine.vehicles["y"][0, 1:] - 4.0))) + 1]
     ego = engine.vehicles[0, 0]

@@ -29,3 +29,39 @@ SUMO_V1 = Grid(
     training_seeds=10,
 )
 """A motorway of two and of three lanes, in traffic as on `highway` and in twice as dense traffic."""
+
+CROSSING = Axes(
+    (
+        Axis(name="lanes", kind="int", meaning="lanes each way of the ego's road", low=1, high=3),
+        Axis(
+            name="density",
+            kind="float",
+            meaning="divisor of the distances between cars: at 1 a car every 60 m of each lane",
+            above=0.0,
+            high=2.5,
+        ),
+        Axis(
+            name="rule",
+            kind="str",
+            meaning="who goes first: the road across (`yield`), or who came first",
+            choices=("yield", "allway_stop"),
+        ),
+        HIGHWAY["weather"],
+    )
+)
+
+SUMO_CROSSING_V1 = Grid(
+    name="sumo_crossing-v1",
+    world="sumo_crossing",
+    axes=CROSSING,
+    values={
+        "lanes": (1, 2),
+        "density": (1.0, 2.0),
+        "rule": ("yield", "allway_stop"),
+        "weather": ("clear", "rain", "fog"),
+    },
+    episodes=30,
+    block=10,
+    training_seeds=10,
+)
+"""A road of one and of two lanes each way, with gaps of five and of two and a half seconds in the traffic, under both rules."""

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from cavbench.envs.highway.dynamics import VEHICLE_LENGTH, VEHICLE_WIDTH
 from cavbench.envs.highway.spawn import EGO_SPEED
-from cavbench.envs.sumo.motorway import RAMP_LENGTH, START
+from cavbench.envs.sumo.motorway import ON_MOTORWAY, ON_RAMP, RAMP_LENGTH, START
+from cavbench.scenarios import Cell
 
 
 class Model(IntEnum):
@@ -32,8 +33,12 @@ CAR = np.dtype(
         ("row", np.int64),  # of the batch
         ("number", np.int64),  # of the car in its episode; 0 is the ego
         ("model", np.int64),
-        ("lane", np.int64),  # from the left; -1 is the ramp
-        ("front", np.float64),  # m along the road up to the front bumper; on the ramp, minus the distance to its end
+        ("route", np.int64),  # of the layout
+        ("lane", np.int64),  # from the left
+        (
+            "front",
+            np.float64,
+        ),  # m along the road up to the front bumper; below 0, minus the distance to the end of its stretch
         ("speed", np.float64),  # m/s
         ("desired", np.float64),  # m/s
     ]
@@ -82,17 +87,17 @@ def types() -> str:
     return "\n".join(("<routes>", *lines, "</routes>"))
 
 
-def start(row: int, seed: int, lanes: int, density: float, vehicles: int, ego: Model) -> NDArray[np.void]:
-    """The cars [N] of an episode at its start, the ego first.
+def start(row: int, seed: int, cell: Cell, vehicles: int, ego: Model) -> NDArray[np.void]:
+    """The cars [N] of an episode on the motorway at its start, the ego first.
 
     Args:
         row: of the batch.
         seed: scenario seed, at least 0.
-        lanes, density: of the cell.
+        cell: `lanes`, `density`.
         vehicles: number of cars of the traffic; fewer, if the road ahead has no room for them.
         ego: what drives the ego.
     """
-    draws = np.random.default_rng(seed)
+    draws, lanes, density = np.random.default_rng(seed), cell.lanes, cell.density
     spacing = lanes * SPACING * np.exp(-lanes / 8) / density
     # The speed at which the shortest distance is safe.
     flowing = max(SLOWEST, ((1 - SPREAD) * spacing - VEHICLE_LENGTH - STANDING_GAP) / TIME_GAP)
@@ -104,17 +109,17 @@ def start(row: int, seed: int, lanes: int, density: float, vehicles: int, ego: M
     cars["number"] = np.arange(len(cars))
     cars["model"] = draws.choice((Model.KRAUSS, Model.EIDM), len(cars))
     cars["desired"] = draws.normal(DESIRED_MEAN, DESIRED_DEVIATION, len(cars)).clip(*DESIRED_RANGE)
-    cars[0] = (row, 0, ego, own_lane, START, EGO_SPEED, IDM_SPEED)
+    cars[0] = (row, 0, ego, ON_MOTORWAY, own_lane, START, EGO_SPEED, IDM_SPEED)
     through = cars[1 : 1 + len(chosen)]
     through["front"] = [START + place for place, _ in chosen]
     through["lane"] = [lane for _, lane in chosen]
     through["speed"] = np.minimum(through["desired"], flowing)
     ramp = cars[1 + len(chosen) :]
     gaps = (VEHICLE_LENGTH + STANDING_GAP + TIME_GAP * RAMP_SPEED) * draws.uniform(1, 2, on_ramp) / min(density, 1.0)
-    ramp["lane"] = -1
+    ramp["route"] = ON_RAMP
     ramp["front"] = -draws.uniform(*RAMP_FIRST) - np.cumsum(gaps) + (gaps[0] if on_ramp else 0)
     ramp["speed"] = RAMP_SPEED
-    return cars[(cars["lane"] >= 0) | (cars["front"] > VEHICLE_LENGTH - RAMP_LENGTH)]
+    return cars[cars["front"] > VEHICLE_LENGTH - RAMP_LENGTH]
 
 
 def _places(

@@ -1,4 +1,4 @@
-"""B episodes on SUMO's motorway: the ego is moved, and everything is measured, by the code of `highway`; SUMO moves the traffic.
+"""B episodes in SUMO's traffic: the ego is moved, and everything is measured, by the code of `highway`; SUMO moves the traffic.
 
 A step: the ego acts and moves by itself. SUMO is told where the ego then is, and moves all others, which see it where it was.
 Then collisions, progress and observation are computed from where all bodies are.
@@ -7,6 +7,8 @@ Then collisions, progress and observation are computed from where all bodies are
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +26,7 @@ from cavbench.envs.highway.dynamics import (
     update_direction,
     wrap_to_pi,
 )
-from cavbench.envs.highway.ego import apply_action, score
+from cavbench.envs.highway.ego import apply_action, score, speed_share
 from cavbench.envs.highway.engine import (
     HighwayEngine,
     Number,
@@ -34,8 +36,10 @@ from cavbench.envs.highway.engine import (
 )
 from cavbench.envs.highway.search import sort_by_position
 from cavbench.envs.highway.state import EgoKind, Episode, Floats, Integers, Parameters, Vehicle, Vehicles
-from cavbench.envs.sumo.cars import PERIOD_MS, Model, start
+from cavbench.envs.sumo.cars import PERIOD_MS, Model
 from cavbench.envs.sumo.processes import Processes
+from cavbench.envs.sumo.roads import Road
+from cavbench.scenarios import Cell
 
 DISCRETE, IDM = int(EgoKind.DISCRETE), int(EgoKind.IDM)
 NOWHERE = -1e6
@@ -146,9 +150,10 @@ def judge(
     episodes: NDArray[np.void],
     moving: NDArray[np.bool_],
     places: Floats,
+    speed_alone: bool,
     parameters: Parameters,
 ) -> None:
-    """What came of a step in the episodes `moving` [B]."""
+    """What came of a step in the episodes `moving` [B]; only the speed is progress if `speed_alone`."""
     corners = np.empty((2, 5, 2))
     for number in range(episodes.size):
         if moving[number]:
@@ -156,7 +161,27 @@ def judge(
             take_places(cars, order[number], episode, places[number], parameters)
             cars[0].crashed = hits(cars, corners) >= 0
             episode.steps += 1
+            before = episode.progress
             score(cars, episode, parameters)
+            if speed_alone and not (episode.crashed or episode.offroad):
+                episode.progress = before + speed_share(cars[0], parameters)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Where the traffic drives.
+
+    Args:
+        layout: name of the layout of the roads.
+        road: the road of a cell.
+        start: the cars at the start, from row, seed, cell, number of cars of the traffic and what drives the ego.
+        speed_alone: whether only the speed is progress, and not the lane.
+    """
+
+    layout: str
+    road: Callable[[Cell], Road]
+    start: Callable[[int, int, Cell, int, Model], NDArray[np.void]]
+    speed_alone: bool = False
 
 
 class SumoEngine(HighwayEngine):
@@ -164,19 +189,22 @@ class SumoEngine(HighwayEngine):
 
     Args:
         config: of `highway`; its physics frames are one a decision.
+        scene: where.
         processes: number of simulations that hold the batch.
 
     Raises:
         UserError: if SUMO is not installed, or cannot start.
     """
 
-    def __init__(self, config: HighwayConfig, processes: int = 1) -> None:
+    def __init__(self, config: HighwayConfig, scene: Scene, processes: int = 1) -> None:
         super().__init__(config)
         # SUMO's step is no whole share of a second.
         self.parameters = self.parameters._replace(dt=PERIOD_MS / 1000)
+        self.scene = scene
         self.ego = Model.IDM if config.driver == "idm" else Model.EGO
         self.places = np.full((config.batch, 4), np.nan)
-        self.processes = Processes([cell.lanes for cell in config.cells], config.vehicles + 1, processes)
+        roads = [scene.road(cell) for cell in config.cells]
+        self.processes = Processes(scene.layout, roads, config.vehicles + 1, processes)
 
     def reset(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         """See `HighwayEngine.reset`."""
@@ -195,7 +223,7 @@ class SumoEngine(HighwayEngine):
 
     def _cars(self, row: np.int64, seed: np.int64) -> NDArray[np.void]:
         cell = self.config.cells[row]
-        return start(int(row), int(seed), cell.lanes, cell.density, self.config.vehicles, self.ego)
+        return self.scene.start(int(row), int(seed), cell, self.config.vehicles, self.ego)
 
     def step(self, action: NDArray[np.generic], paused: NDArray[np.bool_] | None = None) -> None:
         """See `HighwayEngine.step`.
@@ -221,7 +249,8 @@ class SumoEngine(HighwayEngine):
                 break
             move_egos(self.vehicles, self.episodes, actions, controls, moving, held == 0, self.parameters, self.places)
             places = self.processes.step(self.places)
-            judge(self.vehicles, self.order, self.episodes, moving, places, self.parameters)
+            arrays = self.vehicles, self.order, self.episodes
+            judge(*arrays, moving, places, self.scene.speed_alone, self.parameters)
             # SUMO need not drive what nobody sees any more.
             self.processes.remove(np.flatnonzero(moving & self._ended()))
         outputs = self.observation, self.numbers, self.flags

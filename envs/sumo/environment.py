@@ -1,4 +1,4 @@
-"""The world `sumo` as a TorchRL environment."""
+"""The worlds with SUMO's traffic as TorchRL environments."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from cavbench.envs.highway.config import HighwayConfig
 from cavbench.envs.highway.environment import HighwayEnv
-from cavbench.envs.sumo.engine import SumoEngine
+from cavbench.envs.sumo.engine import Scene, SumoEngine
 
 
 class SumoEnv(HighwayEnv):
@@ -15,12 +15,13 @@ class SumoEnv(HighwayEnv):
 
     Args:
         config: of `highway`.
+        scene: where.
         processes: number of simulations that hold the batch.
     """
 
-    def __init__(self, config: HighwayConfig, processes: int = 1) -> None:
+    def __init__(self, config: HighwayConfig, scene: Scene, processes: int = 1) -> None:
         super().__init__(config)
-        self.engine = SumoEngine(config, processes)
+        self.engine = SumoEngine(config, scene, processes)
 
     def _start(self, chosen: NDArray[np.int64], seeds: NDArray[np.int64]) -> None:
         self.engine.reset(chosen, seeds)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from cavbench.envs.highway.dynamics import LANE_WIDTH
+from cavbench.envs.sumo.roads import Road, edge
 
 START = 300.0
 """Where the front bumper of the ego starts, in m along the motorway."""
@@ -25,11 +26,8 @@ SPEED_LIMIT = 40.0
 THROUGH = ("before", "merge", "after")
 """The stretches of the motorway, in order."""
 RAMP = "ramp"
-
-
-def edge(name: str, row: int) -> str:
-    """The name of a stretch of the road of row `row` of the batch."""
-    return f"{name}_{row}"
+ON_MOTORWAY, ON_RAMP = range(2)
+"""Numbers of the routes."""
 
 
 def lane_number(name: str, lane: int, lanes: int) -> int:
@@ -37,13 +35,27 @@ def lane_number(name: str, lane: int, lanes: int) -> int:
     return lanes - lane if name == "merge" else lanes - 1 - lane
 
 
-def plain_network(lanes: Sequence[int]) -> dict[str, str]:
-    """netconvert's plain XML of one motorway a row, by option of netconvert; `lanes` [R] are their lanes."""
+def plain_network(roads: Sequence[Road]) -> dict[str, str]:
+    """netconvert's plain XML of one motorway a row, by option of netconvert."""
+    lanes = [road.lanes for road in roads]
     return {
         "--node-files": "\n".join(("<nodes>", *_nodes(lanes), "</nodes>")),
         "--edge-files": "\n".join(("<edges>", *_edges(lanes), "</edges>")),
         "--connection-files": "\n".join(("<connections>", *_connections(lanes), "</connections>")),
     }
+
+
+def routes(row: int) -> list[list[str]]:
+    """The edges of each route, in order: `ON_MOTORWAY` and `ON_RAMP`."""
+    through = [edge(name, row) for name in THROUGH]
+    return [through, [edge(RAMP, row), *through[1:]]]
+
+
+def stretches(row: int, route: int, lane: int, lanes: int) -> list[str]:
+    """SUMO's lanes on which a car of a route may start in lane `lane` (from the left), one behind the other."""
+    if route == ON_RAMP:
+        return [f"{edge(RAMP, row)}_0"]
+    return [f"{edge(name, row)}_{lane_number(name, lane, lanes)}" for name in THROUGH]
 
 
 def _ends(row: int) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ from pathlib import Path
 from platformdirs import user_cache_path
 
 from cavbench.envs.sumo.cars import types
-from cavbench.envs.sumo.motorway import plain_network
+from cavbench.envs.sumo.layouts import LAYOUTS
+from cavbench.envs.sumo.roads import Road
 from cavbench.errors import UserError
 from cavbench.files import scratch, whole
 
@@ -49,13 +50,13 @@ def types_file() -> Path:
     return _kept(text, "rou.xml") or _keep(text.encode(), text, "rou.xml")
 
 
-def network_file(lanes: Sequence[int]) -> Path:
-    """The network with a motorway for each of `lanes` [R].
+def network_file(layout: str, roads: Sequence[Road]) -> Path:
+    """The network with a road of the layout for each of `roads` [R].
 
     Raises:
         UserError: if netconvert refuses it, or the cache cannot be written.
     """
-    parts = plain_network(lanes)
+    parts = LAYOUTS[layout].plain_network(roads)
     key = f"{metadata.version('eclipse-sumo')} {parts}"
     return _kept(key, "net.xml") or _keep(_converted(parts), key, "net.xml")
 

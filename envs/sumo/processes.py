@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cavbench.envs.sumo import network
 from cavbench.envs.sumo.cars import CAR
+from cavbench.envs.sumo.roads import Road
 from cavbench.envs.sumo.worker import COLUMNS, Command
 from cavbench.errors import UserError
 
@@ -27,18 +28,19 @@ class Process:
     """One simulation in a process of its own.
 
     Args:
-        lanes: lanes of the motorway of each row [R].
+        layout: of `LAYOUTS`.
+        roads: the road of each row [R].
         cars: the most cars of a row, with the ego.
 
     Raises:
         UserError: if SUMO is not installed, or netconvert fails.
     """
 
-    def __init__(self, lanes: Sequence[int], cars: int) -> None:
+    def __init__(self, layout: str, roads: Sequence[Road], cars: int) -> None:
         network.check_installed()
-        self.shape = len(lanes), cars, COLUMNS
-        self.network = network.network_file(lanes)
-        files = [str(self.network), str(network.types_file())]
+        self.shape = len(roads), cars, COLUMNS
+        self.network = network.network_file(layout, roads)
+        files = [layout, str(self.network), str(network.types_file())]
         self.complaints = tempfile.TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(
             [sys.executable, "-m", "cavbench.envs.sumo.worker", *files, *map(str, self.shape[:2])],
@@ -99,14 +101,15 @@ class Processes:
     """Several simulations that hold a batch together, each a part of its rows.
 
     Args:
-        lanes: lanes of the motorway of each episode [B].
+        layout: of `LAYOUTS`.
+        roads: the road of each episode [B].
         cars: the most cars of an episode, with the ego.
         count: number of processes; at most one an episode is made.
     """
 
-    def __init__(self, lanes: Sequence[int], cars: int, count: int) -> None:
-        self.parts = [part for part in np.array_split(np.arange(len(lanes)), count) if len(part)]
-        self.processes = [Process([lanes[row] for row in part], cars) for part in self.parts]
+    def __init__(self, layout: str, roads: Sequence[Road], cars: int, count: int) -> None:
+        self.parts = [part for part in np.array_split(np.arange(len(roads)), count) if len(part)]
+        self.processes = [Process(layout, [roads[row] for row in part], cars) for part in self.parts]
 
     def close(self) -> None:
         """End them."""

@@ -1,6 +1,6 @@
 """The process of one SUMO simulation: libsumo has one in a process, and a second start closes the first one.
 
-    python -m cavbench.envs.sumo.worker NETWORK TYPES ROWS CARS
+    python -m cavbench.envs.sumo.worker LAYOUT NETWORK TYPES ROWS CARS
 
 It reads commands from its standard input and answers on its standard output, in numbers of numpy (`Command`).
 """
@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.envs.sumo.cars import CAR, PERIOD_MS, Model
-from cavbench.envs.sumo.motorway import RAMP, THROUGH, edge, lane_number
+from cavbench.envs.sumo.layouts import LAYOUTS, Layout
 
 
 class Command(Enum):
@@ -60,34 +60,35 @@ def arguments(network: str, cars: str) -> list[str]:
 
 
 class Simulation:
-    """libsumo with one motorway a row, and what is known of its cars.
+    """libsumo with one road a row, and what is known of its cars.
 
     Args:
         sumo: the module libsumo, started.
-        rows: motorways.
+        layout: of the roads.
+        rows: roads.
         cars: the most cars of one, with the ego.
     """
 
-    def __init__(self, sumo: Any, rows: int, cars: int) -> None:
-        self.sumo, self.vehicle = sumo, sumo.vehicle
+    def __init__(self, sumo: Any, layout: Layout, rows: int, cars: int) -> None:
+        self.sumo, self.vehicle, self.layout = sumo, sumo.vehicle, layout
+        self.routes = [layout.routes(row) for row in range(rows)]
         self.names: list[list[str | None]] = [[None] * cars for _ in range(rows)]
         self.places: dict[str, tuple[int, int]] = {}
         self.serial = 0
         self.lengths: dict[str, tuple[float, float]] = {}
         for row in range(rows):
-            stretches = [edge(name, row) for name in THROUGH]
-            sumo.route.add(f"through_{row}", stretches)
-            sumo.route.add(f"ramp_{row}", [edge(RAMP, row), *stretches[1:]])
+            for number, edges in enumerate(self.routes[row]):
+                sumo.route.add(_route(row, number), edges)
 
     def create(self, cars: NDArray[np.void]) -> None:
         """Put cars on their roads."""
         for car in cars:
-            row, number, on_ramp = int(car["row"]), int(car["number"]), car["lane"] < 0
+            row, number, route = int(car["row"]), int(car["number"]), int(car["route"])
             self.serial += 1
             name = f"{row}.{number}.{self.serial}"
-            self.vehicle.add(name, f"{'ramp' if on_ramp else 'through'}_{row}", typeID=Model(car["model"]).name)
+            self.vehicle.add(name, _route(row, route), typeID=Model(car["model"]).name)
             # A car that is only added departs later, where SUMO has room for it.
-            self.vehicle.moveTo(name, *self._lane(row, int(car["lane"]), float(car["front"])))
+            self.vehicle.moveTo(name, *self._place(row, route, int(car["lane"]), float(car["front"])))
             # Without an acceleration it goes on with that which takes it from 0 to this speed.
             self.vehicle.setPreviousSpeed(name, float(car["speed"]), 0.0)
             if car["model"] == Model.EGO:
@@ -97,15 +98,14 @@ class Simulation:
             self.names[row][number] = name
             self.places[name] = row, number
 
-    def _lane(self, row: int, lane: int, front: float) -> tuple[str, float]:
+    def _place(self, row: int, route: int, lane: int, front: float) -> tuple[str, float]:
         """SUMO's lane, and m along it. A place on a junction is moved to the nearest one off it."""
-        if lane < 0:
-            ramp = f"{edge(RAMP, row)}_0"
-            return ramp, self._extent(ramp)[1] + front
-        lanes = self.sumo.edge.getLaneNumber(edge(THROUGH[0], row))
+        lanes = self.sumo.edge.getLaneNumber(self.routes[row][route][0])
+        stretches = self.layout.stretches(row, route, lane, lanes)
+        if front < 0:
+            return stretches[0], self._extent(stretches[0])[1] + front
         nearest = float("inf")
-        for name in THROUGH:
-            stretch = f"{edge(name, row)}_{lane_number(name, lane, lanes)}"
+        for stretch in stretches:
             begin, length = self._extent(stretch)
             along = min(max(front - begin, 0.0), length - CLEAR)
             if abs(begin + along - front) < nearest:
@@ -119,7 +119,7 @@ class Simulation:
         return self.lengths[lane]
 
     def remove(self, rows: NDArray[np.int64]) -> None:
-        """Take all cars of some motorways off the road."""
+        """Take all cars of some rows off the road."""
         for row in rows.tolist():
             for number, name in enumerate(self.names[row]):
                 if name is not None:
@@ -146,6 +146,11 @@ class Simulation:
             for name in names:
                 values.extend(ABSENT if name is None else (*position(name), speed(name), angle(name)))
         return values.tobytes()
+
+
+def _route(row: int, number: int) -> str:
+    """The name of a route."""
+    return f"{row}.{number}"
 
 
 def read(stream: BinaryIO, kind: Any) -> NDArray[Any]:
@@ -177,10 +182,10 @@ def main() -> None:
     os.dup2(2, 1)
     import libsumo
 
-    network, cars, *sizes = sys.argv[1:]
+    layout, network, cars, *sizes = sys.argv[1:]
     try:
         libsumo.start(arguments(network, cars))
-        serve(Simulation(libsumo, *map(int, sizes)), sys.stdin.buffer, answers)
+        serve(Simulation(libsumo, LAYOUTS[layout], *map(int, sizes)), sys.stdin.buffer, answers)
     except libsumo.TraCIException as error:
         print(f"Error: {error}", file=sys.stderr, flush=True)  # noqa: T201
         # An end of Python may wait for SUMO, which has none after an error.

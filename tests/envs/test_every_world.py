@@ -10,6 +10,6 @@ NEEDS = {"gym": {"id": "merge-v0"}}
 its own that is skipped where SUMO is not installed."""
 
 
-@each(sorted(WORLDS.keys() - {"photos", "recorded", "sumo"}))
+@each(sorted(WORLDS.keys() - {"photos", "recorded", "sumo", "sumo_crossing"}))
 def test_it_keeps_the_rules(name: str) -> None:
     assert broken("world", name, **NEEDS.get(name, {})) == {}

@@ -16,17 +16,19 @@ import pytest
 from cavbench.driving import Control
 from cavbench.envs.highway.config import ACTIONS
 from cavbench.envs.highway.engine import Flag, Number
-from cavbench.envs.sumo import network
+from cavbench.envs.sumo import motorway, network
 from cavbench.envs.sumo.axes import SUMO
 from cavbench.envs.sumo.cars import PERIOD_MS, Model, start
 from cavbench.envs.sumo.engine import SumoEngine
-from cavbench.envs.sumo.motorway import START
+from cavbench.envs.sumo.motorway import ON_MOTORWAY, START
 from cavbench.envs.sumo.processes import Processes
+from cavbench.envs.sumo.roads import Road
 from cavbench.envs.sumo.worker import arguments
 from cavbench.envs.sumo.world import SumoWorld
 
 pytest.importorskip("libsumo", reason="needs SUMO: pip install 'cavbench[sumo]'")
 
+WORLD = SumoWorld()
 CELL = SUMO.cell(lanes=3, density=1.0)
 SEED = 1_000_000
 STEP_S = PERIOD_MS / 1000
@@ -50,7 +52,7 @@ def put(name, lane, front, kind="KRAUSS", speed=20.0):
 
 def shown(program: str) -> Any:
     """What a program with libsumo on a motorway prints last, as JSON."""
-    command = arguments(str(network.network_file([3])), str(network.types_file()))
+    command = arguments(str(network.network_file("motorway", [Road(3)])), str(network.types_file()))
     told = subprocess.run(
         [sys.executable, "-c", LIBSUMO + program, json.dumps(command)], capture_output=True, text=True, check=False
     )
@@ -64,7 +66,7 @@ def engine(
 ) -> Iterator[SumoEngine]:
     """An engine on motorways of three lanes."""
     control = Control(driver=driver, action_type=action_type)  # type: ignore[arg-type]
-    made = SumoEngine(SumoWorld().configuration((CELL,) * batch, control), processes)
+    made = SumoEngine(WORLD.configuration((CELL,) * batch, control), WORLD.scene(), processes)
     with closing(made.processes):
         yield made
 
@@ -127,13 +129,13 @@ print(libsumo.simulation.getTime())"""
 def test_a_car_that_is_only_added_is_nowhere_and_those_of_an_episode_are_there_at_their_speed() -> None:
     added = "begin(); libsumo.vehicle.add('car', 'way', typeID='KRAUSS'); print(libsumo.vehicle.getPosition('car')[0])"
     assert shown(added) == -1073741824.0
-    cars = start(0, SEED, 3, 1.0, 20, Model.EGO)
+    cars = start(0, SEED, CELL, 20, Model.EGO)
     with engine() as made:
         made.reset(np.arange(1), np.array([SEED]))
         there = made.vehicles[0]
         assert len(cars) == 21
         assert there["speed"] == pytest.approx(cars["speed"])
-        through = cars["lane"] >= 0
+        through = cars["route"] == ON_MOTORWAY
         assert there["y"][through] == pytest.approx(4.0 * cars["lane"][through])
         made.step(np.array([IDLE]))
         assert there["speed"] == pytest.approx(cars["speed"], abs=0.7)
@@ -257,11 +259,11 @@ def test_finished_episodes_do_not_change_and_cost_no_car() -> None:
 
 def test_a_damaged_network_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    kept = network.network_file([2])
+    kept = network.network_file("motorway", [Road(2)])
     assert kept.is_relative_to(tmp_path)
-    assert network.network_file([2]) == kept
+    assert network.network_file("motorway", [Road(2)]) == kept
     kept.write_bytes(kept.read_bytes()[:2000])
-    damaged = Processes([2], 2, 1)
+    damaged = Processes("motorway", [Road(2)], 2, 1)
     with closing(damaged), pytest.raises(network.UserError) as caught:
         damaged.state()
     assert str(caught.value).startswith("SUMO has ended: ")
@@ -271,8 +273,9 @@ def test_a_damaged_network_is_one_line(tmp_path: Path, monkeypatch: pytest.Monke
 
 def test_what_netconvert_refuses_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(network, "plain_network", lambda lanes: {"--node-files": "<nodes>", "--edge-files": "<edges/>"})
+    broken = {"--node-files": "<nodes>", "--edge-files": "<edges/>"}
+    monkeypatch.setattr(motorway, "plain_network", lambda roads: broken)
     with pytest.raises(network.UserError, match="netconvert made no network: ") as caught:
-        network.network_file([2])
+        network.network_file("motorway", [Road(2)])
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.rglob("*.xml"))

@@ -14,6 +14,7 @@ from cavbench.envs.highway.world import HighwayWorld
 from cavbench.envs.sumo import network
 from cavbench.envs.sumo.axes import SUMO, SUMO_V1
 from cavbench.envs.sumo.cars import Model, start
+from cavbench.envs.sumo.motorway import ON_MOTORWAY, ON_RAMP
 from cavbench.envs.sumo.world import SumoWorld
 from cavbench.errors import UserError
 from tests.checks.rules import broken
@@ -37,7 +38,7 @@ def test_it_keeps_the_rules_of_every_world() -> None:
         ({"target_speeds": (30.0, 20.0)}, "increasing speeds"),
         ({"vehicles": 0}, "vehicles must be between 1 and 1000"),
         ({"max_steps": 0}, "max_steps must be"),
-        ({"max_steps": 900}, "max_steps must be at most 820, where the motorway ends"),
+        ({"max_steps": 900}, "max_steps must be at most 820, where the road ends"),
     ],
 )
 def test_a_wrong_parameter_is_one_line(options: dict[str, object], message: str) -> None:
@@ -79,16 +80,17 @@ def test_policies_of_highway_find_their_features_and_actions() -> None:
 def test_the_cars_of_an_episode_follow_from_its_seed() -> None:
     for cell in SUMO_V1.cells():
         for seed in range(1_000_000, 1_000_020):
-            cars = start(3, seed, cell.lanes, cell.density, 20, Model.EGO)
-            assert cars.tobytes() == start(3, seed, cell.lanes, cell.density, 20, Model.EGO).tobytes()
+            cars = start(3, seed, cell, 20, Model.EGO)
+            assert cars.tobytes() == start(3, seed, cell, 20, Model.EGO).tobytes()
             assert (cars["number"] < 21).all()
             assert cars["model"][0] == Model.EGO
             assert cars["lane"].max() < cell.lanes
-            for lane in range(-1, cell.lanes):
-                fronts = np.sort(cars["front"][cars["lane"] == lane])
+            for route, lane in [(ON_RAMP, 0), *((ON_MOTORWAY, lane) for lane in range(cell.lanes))]:
+                fronts = np.sort(cars["front"][(cars["route"] == route) & (cars["lane"] == lane)])
                 # No two bodies touch, and SUMO's gap between bumpers is there.
                 assert (np.diff(fronts) > 7.5).all()
-    assert start(0, 1, 3, 1.0, 20, Model.EGO).tobytes() != start(0, 2, 3, 1.0, 20, Model.EGO).tobytes()
+    home = SumoWorld().home
+    assert start(0, 1, home, 20, Model.EGO).tobytes() != start(0, 2, home, 20, Model.EGO).tobytes()
 
 
 @needs_sumo
