@@ -81,6 +81,7 @@ FIGURES = {
     "world_racetrack.svg": "roads:racetrack",
     "world_u_turn.svg": "roads:u_turn",
     "world_sumo.svg": "sumo:sumo",
+    "world_sumo_crossing.svg": "sumo:crossing",
     "world_platoon.png": "platoon:world",
     "world_camera.webp": "camera:world",
     "world_crossing.png": "crossing:world",
