@@ -41,6 +41,8 @@ LOOK_AHEAD_S = 0.8
 """A car aims for the lane in which it will be after so many seconds."""
 SLOW = 1.0
 """The velocity of a slower car, in m/s, does not say where it heads."""
+BACKWARDS = 5.0
+"""Cars do not drive backwards faster than this, in m/s: highway-env's IDM backs away from a car that stands."""
 GATE = 4.0
 """A measurement farther than this in m from a predicted car belongs to another car."""
 EDGE = 1.0
@@ -49,6 +51,8 @@ CATCH_UP = 0.3
 """The share of a wrong place that changes a speed which is beyond the range of the sensor."""
 STANDS = 2.5
 """A row nearer than this in m to a known obstacle is the obstacle."""
+FASTER_THAN, SURELY = 0.5, 4.0
+"""A car that gains so much more in m/s2 than predicted, and so many standard deviations, wants to be as fast as its lane allows."""
 SURE = 1e-4
 """An action explains the ego's motion better than IDLE by at least so much, in m and m/s."""
 DISCRETE, IDM, OBSTACLE = int(Kind.DISCRETE), int(Kind.IDM), int(Kind.OBSTACLE)
@@ -59,22 +63,44 @@ FIELDS = ("x", "y", "speed", "heading", "target_speed", "target_lane", "timer", 
 """What a belief holds of each car; the first one is the ego."""
 
 
+@inner
+def agreeing(road: Road, row: int, first: int, usual: int) -> int:
+    """How many of the routes to `usual` destinations, from the row `first` on, have the roads of a route, up to the first fork."""
+    place = 0
+    while True:
+        found = 0
+        for other in range(first, first + usual):
+            same = True
+            for before in range(place + 1):
+                same &= road.routes[other, before] == road.routes[row, before]
+            found += 1 if same else 0
+        if found < usual or road.routes[row, place] < 0:
+            return found
+        place += 1
+
+
 @entry_point
 def guess_routes(roads: NDArray[np.void], destinations: int, usual: int, guesses: Integers) -> None:
-    """Of each lane [R, L] the route that turns the least, among those to the `usual` first of its destinations; -1 for none."""
+    """Of each lane [R, L] the route by which most of the `usual` first destinations are reached, of those the one that turns least.
+
+    It is -1 for none.
+    """
     guesses[:] = -1
     for number in range(roads.size):
         road = roads[number]
         for own in range(road.lane_count):
-            start, least = heading_at(road.lanes[own], 0.0), np.inf
-            for goal in range(usual):
-                row, last = own * destinations + goal, 0
+            start, most = heading_at(road.lanes[own], 0.0), -np.inf
+            for row in range(own * destinations, own * destinations + usual):
+                last = 0
                 while last + 1 < road.routes.shape[1] and road.routes[row, last + 1] >= 0:
                     last += 1
+                if last == 0 and destinations > 1:
+                    continue
                 end = road.lanes[road.edges[road.routes[row, last]].first]
                 turned = abs(wrap_to_pi(heading_at(end, end.length) - start))
-                if (last > 0 or destinations == 1) and turned < least - 1e-6:
-                    guesses[number, own], least = row, turned
+                liked = 2 * np.pi * agreeing(road, row, own * destinations, usual) - turned
+                if liked > most + 1e-6:
+                    guesses[number, own], most = row, liked
 
 
 @inner
@@ -189,14 +215,22 @@ def follow_ego(road: Road, bodies: Bodies, row: Floats, clipped: NDArray[np.bool
 
 
 @inner
-def put_where_seen(road: Road, body: Body, x: float, y: float, vx: float, vy: float) -> None:
-    """Set the measured part of a known car's state; a slow one heads where it was predicted to."""
-    speed = math.sqrt(vx * vx + vy * vy)
+def head(body: Body, heading: float, vx: float, vy: float) -> None:
+    """Set heading and signed speed from a velocity; a car that is slow, or slowly drives backwards, heads about as `heading` says."""
+    speed, forward = math.sqrt(vx * vx + vy * vy), vx * math.cos(heading) + vy * math.sin(heading)
     if speed < SLOW:
-        body.speed = vx * body.cos_heading + vy * body.sin_heading
+        body.heading, body.speed = heading, forward
+    elif forward < 0.0 and speed < BACKWARDS:
+        body.heading, body.speed = math.atan2(-vy, -vx), -speed
     else:
-        body.speed, body.heading = speed, math.atan2(vy, vx)
-        update_direction(body)
+        body.heading, body.speed = math.atan2(vy, vx), speed
+    update_direction(body)
+
+
+@inner
+def put_where_seen(road: Road, body: Body, x: float, y: float, vx: float, vy: float) -> None:
+    """Set the measured part of a known car's state."""
+    head(body, body.heading, vx, vy)
     body.x, body.y = x, y
     body.crashed = body.impact = False
     update_lane(body, road)
@@ -205,15 +239,14 @@ def put_where_seen(road: Road, body: Body, x: float, y: float, vx: float, vy: fl
 @inner
 def first_sight(road: Road, body: Body, kind: int, x: float, y: float, vx: float, vy: float) -> None:
     """A car that was not known before; a slow one heads along the nearest lane."""
-    speed, heading = math.sqrt(vx * vx + vy * vy), math.atan2(vy, vx)
-    if speed < SLOW:
-        least = np.inf
-        for number in range(road.lane_count):
-            apart = distance_to(road.lanes[number], x, y)
-            if apart < least:
-                along, _ = local_coordinates(road.lanes[number], x, y)
-                heading, least = heading_at(road.lanes[number], along), apart
-    put_body(road, body, kind, x, y, heading, speed)
+    heading, least = 0.0, np.inf
+    for number in range(road.lane_count):
+        apart = distance_to(road.lanes[number], x, y)
+        if apart < least:
+            along, _ = local_coordinates(road.lanes[number], x, y)
+            heading, least = heading_at(road.lanes[number], along), apart
+    head(body, heading, vx, vy)
+    put_body(road, body, kind, x, y, body.heading, body.speed)
     aim(road, body)
 
 
@@ -253,6 +286,7 @@ def see(
     ego = bodies[0]
     ego_vx, ego_vy = ego.speed * ego.cos_heading, ego.speed * ego.sin_heading
     obstacle = bodies[bodies.size - 1]
+    noise = SURELY * episode.noise_sigma
     has_obstacle = put_known_obstacle(road, obstacle, parameters)
     for row in range(1, rows.shape[0]):
         if rows[row, 0] <= 0.0 or clipped[row, 0] != 0 or clipped[row, 1] != 0:
@@ -265,12 +299,17 @@ def see(
         beyond = clipped[row, 2] != 0 or clipped[row, 3] != 0
         if number > 0:
             car = bodies[number]
+            predicted = car.speed
             if clipped[row, 2] != 0:
                 vx = caught_up(car.speed * car.cos_heading, x - car.x, vx, clipped[row, 2], parameters.period)
             if clipped[row, 3] != 0:
                 vy = caught_up(car.speed * car.sin_heading, y - car.y, vy, clipped[row, 3], parameters.period)
             put_where_seen(road, car, x, y, vx, vy)
             aim(road, car)
+            # Where cars give way, one that gains speed no longer has to.
+            surprising = parameters.regulation == 0 and car.speed - predicted > FASTER_THAN * parameters.period + noise
+            if surprising and not beyond:
+                car.target_speed = max(car.target_speed, road.lanes[car.lane].speed_limit)
         elif episode.cars < bodies.size - 1:
             number = episode.cars
             car = bodies[number]

@@ -30,6 +30,8 @@ DESTINATIONS = {
     TaskKind.U_TURN: (1, 1),
 }
 """The destinations of a task's roads, and how many of them, the first ones, are those of the other cars."""
+ROAD = ("network", "goal", "sensor_range", "noise_sigma")
+"""What a belief holds of the road."""
 NEVER = -1.0
 """The chance that a car comes in a simulation: nobody knows when."""
 
@@ -66,6 +68,7 @@ class RoadsDynamics(Dynamics):
             "network": torch.from_numpy(self._networks.astype(np.int64)),
             "goal": torch.tensor([scene.goal for scene in scenes]),
             "sensor_range": torch.tensor([scene.sensor_range for scene in scenes], dtype=torch.float64),
+            "noise_sigma": torch.tensor([scene.noise_sigma for scene in scenes], dtype=torch.float64),
         }
         cars = {name: torch.zeros((batch, self.slots), dtype=torch.float64) for name in FIELDS}
         steps, count = (torch.zeros(batch, dtype=torch.int64) for _ in range(2))
@@ -76,6 +79,7 @@ class RoadsDynamics(Dynamics):
         clipped = np.trunc(rows[..., 1:]).astype(np.int8)
         rows[..., 1:] = rows[..., 1:] * self._half + self._centre
         bodies, episodes = self.placed(before)
+        episodes["noise_sigma"] = before["noise_sigma"].numpy()
         fields = np.zeros((len(rows), self.slots, len(FIELDS)))
         own = self._own(before)
         track_batch(self.roads, bodies, episodes, rows, clipped, own, self.parameters, fields)
@@ -84,7 +88,7 @@ class RoadsDynamics(Dynamics):
     def believed(self, fields: Floats, count: Integers, before: TensorDictBase, *, steps: Integers) -> TensorDict:
         """The belief [B] with cars [B, N, 8], of which the first `count` [B] are known, after `steps` [B] decisions."""
         cars = {name: torch.from_numpy(np.ascontiguousarray(fields[..., place])) for place, name in enumerate(FIELDS)}
-        road = {name: before[name] for name in ("network", "goal", "sensor_range")}
+        road = {name: before[name] for name in ROAD}
         numbers = {"count": count, "steps": steps}
         rest = {name: torch.from_numpy(np.array(values, dtype=np.int64)) for name, values in numbers.items()}
         return TensorDict({**cars, **road, **rest}, batch_size=[len(fields)])
