@@ -51,7 +51,7 @@ CATCH_UP = 0.3
 """The share of a wrong place that changes a speed which is beyond the range of the sensor."""
 STANDS = 2.5
 """A row nearer than this in m to a known obstacle is the obstacle."""
-FASTER_THAN, SURELY = 0.5, 4.0
+FASTER_THAN, SURELY = 0.5, 8.0
 """A car that gains so much more in m/s2 than predicted, and so many standard deviations, wants to be as fast as its lane allows."""
 SURE = 1e-4
 """An action explains the ego's motion better than IDLE by at least so much, in m and m/s."""
