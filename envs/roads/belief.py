@@ -1,7 +1,7 @@
 """An attacker's belief about the cars on a network of lanes, from true observations alone: rebuilt at first sight, then tracked.
 
-An observation lacks target lanes and speeds, routes and lane-change timers. Those of the ego follow from its motion. A car aims for
-the lane where it will be soon, wants the highest speed that it has shown, and goes as straight on as the roads allow.
+An observation lacks target lanes and speeds, routes and lane-change timers. Those of the ego follow from its motion. Another car
+aims for the lane where it will be soon, wants the highest speed that it has shown, and goes where most destinations are.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ CATCH_UP = 0.3
 STANDS = 2.5
 """A row nearer than this in m to a known obstacle is the obstacle."""
 FASTER_THAN, SURELY = 0.5, 8.0
-"""A car that gains so much more in m/s2 than predicted, and so many standard deviations, wants to be as fast as its lane allows."""
+"""A car that gains so much more in m/s2 than predicted, and so many standard deviations, wants the limit of its lane."""
 SURE = 1e-4
 """An action explains the ego's motion better than IDLE by at least so much, in m and m/s."""
 DISCRETE, IDM, OBSTACLE = int(Kind.DISCRETE), int(Kind.IDM), int(Kind.OBSTACLE)
@@ -65,7 +65,7 @@ FIELDS = ("x", "y", "speed", "heading", "target_speed", "target_lane", "timer", 
 
 @inner
 def agreeing(road: Road, row: int, first: int, usual: int) -> int:
-    """How many of the routes to `usual` destinations, from the row `first` on, have the roads of a route, up to the first fork."""
+    """How many of the `usual` routes from the row `first` on have the roads of a route, up to the first fork."""
     place = 0
     while True:
         found = 0
@@ -81,10 +81,7 @@ def agreeing(road: Road, row: int, first: int, usual: int) -> int:
 
 @entry_point
 def guess_routes(roads: NDArray[np.void], destinations: int, usual: int, guesses: Integers) -> None:
-    """Of each lane [R, L] the route by which most of the `usual` first destinations are reached, of those the one that turns least.
-
-    It is -1 for none.
-    """
+    """Of each lane [R, L] the route on which most of the `usual` first destinations are, then the one that turns least; or -1."""
     guesses[:] = -1
     for number in range(roads.size):
         road = roads[number]
@@ -194,8 +191,10 @@ def place_batch(
 
 
 @inner
-def follow_ego(road: Road, bodies: Bodies, row: Floats, clipped: NDArray[np.bool_], parameters: Parameters, trial: Bodies) -> None:
-    """Give the ego of the last belief the action that explains the motion [4] that is measured now; `trial` [1] is a work array."""
+def follow_ego(
+    road: Road, bodies: Bodies, row: Floats, clipped: NDArray[np.bool_], parameters: Parameters, trial: Bodies
+) -> None:
+    """Give the ego of the last belief the action that explains what is measured now [4]; `trial` [1] is a work array."""
     found, least = IDLE, np.inf
     for number in range(5):
         # IDLE first: it wins a tie.
@@ -216,7 +215,7 @@ def follow_ego(road: Road, bodies: Bodies, row: Floats, clipped: NDArray[np.bool
 
 @inner
 def head(body: Body, heading: float, vx: float, vy: float) -> None:
-    """Set heading and signed speed from a velocity; a car that is slow, or slowly drives backwards, heads about as `heading` says."""
+    """Set heading and signed speed from a velocity; a car that is slow, or backs away, heads about as `heading` says."""
     speed, forward = math.sqrt(vx * vx + vy * vy), vx * math.cos(heading) + vy * math.sin(heading)
     if speed < SLOW:
         body.heading, body.speed = heading, forward
@@ -263,7 +262,7 @@ def nearest_prediction(bodies: Bodies, taken: NDArray[np.bool_], count: int, x: 
 
 @inner
 def caught_up(predicted: float, off: float, shown: float, edge: float, period: float) -> float:
-    """A component of a velocity in m/s that is beyond the range of the sensor, which shows `shown`, at its upper (1) or lower edge (-1).
+    """A component of a velocity in m/s that is beyond the upper (1) or lower edge (-1) of its range, where `shown` is.
 
     It follows from the motion: `off` is by how many m the predicted place was wrong.
     """
@@ -336,7 +335,9 @@ def is_hidden(road: Road, ego: Body, car: Body, episode: Episode, parameters: Pa
 
 
 @inner
-def forget(road: Road, bodies: Bodies, episode: Episode, parameters: Parameters, taken: NDArray[np.bool_], full: bool) -> None:
+def forget(
+    road: Road, bodies: Bodies, episode: Episode, parameters: Parameters, taken: NDArray[np.bool_], full: bool
+) -> None:
     """Take out the predicted cars that should have been seen, and those that have left the road."""
     ego, farthest = bodies[0], 0.0 if full else np.inf
     for number in range(1, episode.cars):

@@ -1,4 +1,4 @@
-"""Networks of lanes for attackers: beliefs from observations, forecasts and rehearsals from beliefs, on the engine of road networks."""
+"""Networks of lanes for attackers: beliefs from observations, and forecasts from beliefs by the engine of road networks."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from cavbench.envs.recorded.world import RecordedWorld
 from cavbench.envs.recorded.foresight import RecordedDynamics
+from cavbench.envs.recorded.world import RecordedWorld
 from cavbench.envs.roads.recordings import NOTHING
 from tests.envs.recorded.scenes import Road, platoon, scene
 

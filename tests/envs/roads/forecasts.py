@@ -1,11 +1,12 @@
 """What an attacker foresees on road networks, beside what then happens in the engine.
 
-    python -m tests.envs.roads.forecasts [--weather clear] [--episodes 32] [WORLD ...]
+python -m tests.envs.roads.forecasts [--weather clear] [--episodes 32] [WORLD ...]
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,7 +90,10 @@ def errors(world: RoadsWorld, *, weather: str = "clear", episodes: int = 16, fir
         if step % LENGTH < LENGTH - 1:
             continue
         after, cars = env.engine.bodies, env.engine.episodes["cars"]
-        real, failed = after[row, env.engine.episodes["ego"]], env.engine.episodes["crashed"] | env.engine.episodes["offroad"]
+        real, failed = (
+            after[row, env.engine.episodes["ego"]],
+            env.engine.episodes["crashed"] | env.engine.episodes["offroad"],
+        )
         found["failed"].append(np.stack([failed, foreseen.failed[0].numpy()], -1)[running])
         for one in np.nonzero(running & ~done & ~foreseen.failed[0].numpy())[0]:
             mine, seconds = foreseen.engine.bodies[one], LENGTH / world.policy_frequency
@@ -123,10 +127,9 @@ def main() -> None:
         median, most = np.quantile(found.others, [0.5, 0.9])
         straight = np.quantile(found.straight, 0.9)
         real, foreseen = found.failed.T
-        print(
+        sys.stdout.write(
             f"| `{name}` | {found.ego.max():.2f} | {median:.2f} | {most:.2f} | {straight:.2f} | "
-            f"{(real & foreseen).sum()} of {real.sum()} | {(foreseen & ~real).sum()} | {len(found.others)} |",
-            flush=True,
+            f"{(real & foreseen).sum()} of {real.sum()} | {(foreseen & ~real).sum()} | {len(found.others)} |\n"
         )
 
 

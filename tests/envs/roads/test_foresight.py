@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -141,7 +141,7 @@ def test_oncoming_cars_are_believed_to_come_even_beyond_the_range_of_velocities(
 
 
 def test_who_arrives_counts_no_more_than_a_whole_plan() -> None:
-    env, now, dynamics = started(IntersectionWorld(), EPISODES)
+    _, now, dynamics = started(IntersectionWorld(), EPISODES)
     forecast = dynamics.roll(dynamics.believe(now["observation"], dynamics.unknown()), torch.full((1, 299), FASTER))
     assert ((forecast.progress >= 0) & (forecast.progress <= 299)).all()
     assert (forecast.failed == 299).any()
@@ -149,9 +149,14 @@ def test_who_arrives_counts_no_more_than_a_whole_plan() -> None:
 
 def test_continuous_plans_are_forecast_too() -> None:
     cells = [RoundaboutWorld.home] * EPISODES
-    env, dynamics = RoundaboutWorld().make(cells, action_type="continuous"), RoundaboutWorld().dynamics(cells, "continuous")
+    env, dynamics = (
+        RoundaboutWorld().make(cells, action_type="continuous"),
+        RoundaboutWorld().dynamics(cells, "continuous"),
+    )
     assert dynamics is not None
-    belief = dynamics.believe(env.reset(env.reset().set("seed", torch.arange(EPISODES)))["observation"], dynamics.unknown())
+    belief = dynamics.believe(
+        env.reset(env.reset().set("seed", torch.arange(EPISODES)))["observation"], dynamics.unknown()
+    )
     straight, off = torch.zeros(30, 2), torch.tensor([0.0, 1.0]).expand(30, 2)
     forecast = dynamics.roll(belief, torch.stack([straight, off]))
     assert (forecast.failed[:, 1] < 30).all()
@@ -160,7 +165,7 @@ def test_continuous_plans_are_forecast_too() -> None:
 
 def test_a_world_that_observes_a_grid_has_no_dynamics() -> None:
     class Grid(ExitWorld):
-        rules = {**ExitWorld.rules, "view": ViewKind.OCCUPANCY}
+        rules: ClassVar[dict[str, Any]] = {**ExitWorld.rules, "view": ViewKind.OCCUPANCY}
 
     assert Grid().dynamics([Grid.home], "discrete") is None
 
