@@ -134,7 +134,7 @@ def place_all(
     bodies: Bodies,
     parameters: Parameters,
 ) -> None:
-    """Put the cars of a belief [N, 8], of which the first `episode.cars` are known, on the road."""
+    """Put the cars of a belief [N, 8], of which the first `episode.cars` are known, on the road; `bodies` is [N + 1]."""
     for number in range(bodies.size):
         body = bodies[number]
         if number >= episode.cars:
@@ -147,7 +147,7 @@ def place_all(
         body.route = own[body.lane] if number == 0 else guesses[body.lane]
         body.speed_index = nearest_target_speed(body.target_speed, parameters.target_speeds[: parameters.speeds])
     episode.bodies = episode.cars
-    if episode.cars < bodies.size and put_known_obstacle(road, bodies[episode.cars], parameters):
+    if put_known_obstacle(road, bodies[episode.cars], parameters):
         episode.bodies += 1
     if episode.cars > 0:
         episode.ahead = way_left(road, bodies[0]) if parameters.progress == WAY else bodies[0].x
