@@ -56,8 +56,8 @@ class Distillation(DrivingDefense):
         budget: size of this set after the ramp.
         ramp_to: share of the training at which the budget, which grows from 0, reaches `budget`.
         answers: what an attack is told: `logits`, or `probabilities` at temperature 1, as the first paper's network answers.
-            Their gradients vanish, which only looks like robustness (Carlini and Wagner 2017, arXiv 1608.04644). The decisions
-            are the same.
+            Their gradients nearly vanish, which only looks like robustness (Carlini and Wagner 2017, arXiv 1608.04644). The
+            decisions are the same.
         learning_rate: initial rate of Adam; it falls as in the victim's own training.
         decisions: length of the training, on every road at once.
         trained_in: non-default parameters of the training world, for instance `vehicles=5`; set by `bench train`.
