@@ -137,9 +137,9 @@ class RecordedWorld(RoadsWorld):
     def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics:
         """See `cavbench.driving.DrivingWorld.dynamics`. Nothing of a recording is told."""
         # Imported here because it loads torch and numba, which `bench list` must not load.
-        from cavbench.envs.roads.foresight import RoadsDynamics
+        from cavbench.envs.recorded.foresight import RecordedDynamics
 
-        return RoadsDynamics(self.config(cells, Control(action_type=action_type)))
+        return RecordedDynamics(self.config(cells, Control(action_type=action_type)))
 
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
         # It is called before anything is driven, so a scene that is missing or unfit is named then.

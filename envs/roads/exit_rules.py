@@ -11,6 +11,8 @@ from cavbench.envs.roads.lanes import local_coordinates, position
 from cavbench.envs.roads.state import Bodies, Body, Episode, Floats, Kind, Parameters, Road
 
 EGO_SPEED, EGO_SPACING = 25.0, 2.0
+START_OFFSETS = 3
+"""Vehicle.create_random: the first car of a road starts behind so many and about one more spacings."""
 CONTINUOUS, IDM = int(Kind.CONTINUOUS), int(Kind.IDM)
 
 
@@ -45,7 +47,7 @@ def put_ahead(
     """Vehicle.create_random: a car ahead of all others on a lane."""
     own = road.lanes[road.spots[START] + lane]
     offset = spacing * (12 + 1.0 * speed) * road.factor
-    farthest = 3 * offset
+    farthest = START_OFFSETS * offset
     for number in range(episode.cars):
         along, _ = local_coordinates(own, bodies[number].x, bodies[number].y)
         farthest = along if number == 0 else max(farthest, along)
@@ -54,6 +56,12 @@ def put_ahead(
     put_body(road, bodies[episode.cars], kind, x, y, own.heading, speed)
     episode.cars += 1
     episode.bodies = episode.cars
+
+
+@inner
+def expected_place(road: Road) -> float:
+    """The mean of the places at which the ego starts, in m along the road."""
+    return (START_OFFSETS + 1) * EGO_SPACING * (12 + 1.0 * EGO_SPEED) * road.factor
 
 
 @inner

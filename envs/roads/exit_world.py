@@ -45,6 +45,7 @@ class ExitWorld(RoadsWorld):
     axes: ClassVar[Axes] = EXIT
     grid: ClassVar[str] = EXIT_V1.name
     features: ClassVar[Features] = WIDE_FEATURES
+    lane_changes: ClassVar[bool] = False
     home: ClassVar[Cell] = EXIT.cell(lanes=6, density=1.5)
     rules: ClassVar[Mapping[str, Any]] = {"task": TaskKind.EXIT, "progress": Measure.WAY}
     start_speed: ClassVar[float | None] = 25.0

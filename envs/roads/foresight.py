@@ -1,8 +1,4 @@
-"""Straight parallel lanes for attackers: beliefs from observations, forecasts from beliefs, on the engine of road networks.
-
-An observation has no target speeds and lanes. The ego's target speed follows from its last two speeds, that of another car is its
-speed. A car aims for the lane where it will be soon. Cars follow IDM and keep to that lane.
-"""
+"""Networks of lanes for attackers: beliefs from observations, and forecasts from beliefs by the engine of road networks."""
 
 from __future__ import annotations
 
@@ -14,112 +10,88 @@ from numpy.typing import NDArray
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
-from cavbench.compiled import entry_point
 from cavbench.driving.dynamics import Dynamics, Forecast, Rehearsal
 from cavbench.envs.highway.config import ACTIONS
-from cavbench.envs.highway.dynamics import GAIN_SPEED
-from cavbench.envs.highway.ego import nearest_target_speed
 from cavbench.envs.highway.engine import Flag, Number
-from cavbench.envs.roads.bodies import put_body
+from cavbench.envs.roads.belief import FIELDS, guess_routes, place_batch, track_batch
 from cavbench.envs.roads.clairvoyant import roll_batch
-from cavbench.envs.roads.config import RoadsConfig, parameters
+from cavbench.envs.roads.config import RoadsConfig, TaskKind, parameters
 from cavbench.envs.roads.engine import RoadsEngine
 from cavbench.envs.roads.generator import WORDS
+from cavbench.envs.roads.intersection_rules import SECONDS_BEFORE
+from cavbench.envs.roads.network import MOST_LANES
 from cavbench.envs.roads.recordings import NOTHING
-from cavbench.envs.roads.replay import IDM, OBSTACLE, send_away
 from cavbench.envs.roads.state import BODY, EPISODE, Floats, Integers
 
-FIELDS = ("x", "y", "heading", "speed", "target_speed", "target_y")
-"""What a belief holds of each car; the first one is the ego."""
-LOOK_AHEAD_S = 0.8
-"""A car aims for the lane in which it will be after so many seconds."""
-PRESENCE, X, Y, VX, VY = range(5)
-"""Columns of an observation."""
-
-
-@entry_point
-def place_batch(
-    roads: NDArray[np.void],
-    episodes: NDArray[np.void],
-    fields: Floats,
-    counts: Integers,
-    bodies: NDArray[np.void],
-    parameters: NDArray[np.void],
-) -> None:
-    """Put the cars of beliefs [B, N, 6], of which the first `counts` [B] are known, on the roads of their episodes."""
-    given = parameters[0]
-    for row in range(episodes.size):
-        road = roads[episodes[row].network]
-        for number in range(bodies.shape[1]):
-            body, car = bodies[row, number], fields[row, number]
-            put_body(road, body, given.ego if number == 0 else IDM, car[0], car[1], car[2], car[3])
-            if number >= counts[row]:
-                send_away(body, OBSTACLE)
-                continue
-            body.target_speed, body.changes_lanes = car[4], False
-            body.speed_index = nearest_target_speed(car[4], given.target_speeds[: given.speeds])
-            near = np.inf
-            for lane in range(road.lane_count):
-                if abs(road.lanes[lane].start_y - car[5]) < near:
-                    body.target_lane, near = lane, abs(road.lanes[lane].start_y - car[5])
+DESTINATIONS = {
+    TaskKind.ROUNDABOUT: (6, 3),
+    TaskKind.INTERSECTION: (4, 4),
+    TaskKind.EXIT: (1, 1),
+    TaskKind.U_TURN: (1, 1),
+}
+"""The destinations of a task's roads, and how many of them, the first ones, are those of the other cars."""
+ROAD = ("network", "goal", "sensor_range", "noise_sigma")
+"""What a belief holds of the road."""
+NEVER = -1.0
+"""The chance that a car comes in a simulation: nobody knows when."""
 
 
 class RoadsDynamics(Dynamics):
-    """The rules of motion on straight parallel lanes.
+    """The rules of motion on a network of lanes, for observations that are rows of x, y, vx, vy.
 
     Args:
-        config: configuration with the road of each episode, which is no secret. What was recorded is not looked at.
+        config: configuration with the road of each episode and its ego's destination, which are no secret. What was recorded is
+            not looked at.
+        changes_lanes: whether the other cars change lanes.
     """
 
-    def __init__(self, config: RoadsConfig) -> None:
+    def __init__(self, config: RoadsConfig, *, changes_lanes: bool) -> None:
         scenes = tuple(replace(scene, recordings=NOTHING) for scene in config.scenes)
         self.config = replace(config, scenes=scenes, action_repeat=1, driver="agent", max_steps=10**9)
         self.parameters = parameters(self.config)
+        self.parameters["full_steps"] = config.max_steps
+        self.changes_lanes, self.slots = changes_lanes, max(scene.capacity for scene in scenes)
         self.action_type, self.period = config.action_type, 1 / config.policy_frequency
         self.actions = len(ACTIONS) if config.action_type == "discrete" else 0
         self._engine = engine = RoadsEngine(self.config)
         self.roads, self._networks = engine.roads, engine.episodes["network"].copy()
-        # An observation does not say how far the end of the road is.
-        self.roads["end"] = np.inf
+        self._begin = SECONDS_BEFORE * config.simulation_frequency if config.task == TaskKind.INTERSECTION else 0
+        self._guesses: Integers | None = None
         assert config.low is not None
         assert config.high is not None
         low, high = np.array(config.low), np.array(config.high)
         self._half, self._centre = (high - low) / 2, (high + low) / 2
 
     def unknown(self) -> TensorDict:
-        batch, size = self.config.batch, self.config.observed_vehicles
+        batch, scenes = self.config.batch, self.config.scenes
         road = {
             "network": torch.from_numpy(self._networks.astype(np.int64)),
-            "sensor_range": torch.tensor([scene.sensor_range for scene in self.config.scenes], dtype=torch.float64),
+            "goal": torch.tensor([scene.goal for scene in scenes]),
+            "sensor_range": torch.tensor([scene.sensor_range for scene in scenes], dtype=torch.float64),
+            "noise_sigma": torch.tensor([scene.noise_sigma for scene in scenes], dtype=torch.float64),
         }
-        cars = {name: torch.zeros((batch, size), dtype=torch.float64) for name in FIELDS}
-        return TensorDict({**cars, **road, "count": torch.zeros(batch, dtype=torch.int64)}, batch_size=[batch])
+        cars = {name: torch.zeros((batch, self.slots), dtype=torch.float64) for name in FIELDS}
+        steps, count = (torch.zeros(batch, dtype=torch.int64) for _ in range(2))
+        return TensorDict({**cars, **road, "steps": steps, "count": count}, batch_size=[batch])
 
     def believe(self, observation: Tensor, before: TensorDictBase) -> TensorDict:
         rows = observation.numpy().astype(np.float64)
-        measured = rows[..., X:] * self._half + self._centre
-        there = rows[..., PRESENCE] > 0
-        measured[:, 1:] += measured[:, :1]
-        x, y, vx, vy = (measured[..., column] for column in range(4))
-        speed = np.hypot(vx, vy)
-        heading = np.where(speed > 0, np.arctan2(vy, vx), 0.0)
-        aimed = speed.copy()
-        aimed[:, 0] = self._aimed(speed[:, 0], before["speed"].numpy()[:, 0], before["count"].numpy() > 0)
-        cars = dict(zip(FIELDS, (x, y, heading, speed, aimed, y + LOOK_AHEAD_S * vy), strict=True))
-        # Rows without a car come last.
-        fields = {name: torch.from_numpy(np.where(there, values, 0.0)) for name, values in cars.items()}
-        road = {name: before[name] for name in ("network", "sensor_range")}
-        count = torch.from_numpy(there.sum(1).astype(np.int64))
-        return TensorDict({**fields, **road, "count": count}, batch_size=[len(rows)])
+        clipped = np.trunc(rows[..., 1:]).astype(np.int8)
+        rows[..., 1:] = rows[..., 1:] * self._half + self._centre
+        bodies, episodes = self.placed(before)
+        episodes["noise_sigma"] = before["noise_sigma"].numpy()
+        fields = np.zeros((len(rows), self.slots, len(FIELDS)))
+        own = self._own(before)
+        track_batch(self.roads, bodies, episodes, rows, clipped, own, self.parameters, fields)
+        return self.believed(fields, episodes["cars"], before, steps=episodes["steps"])
 
-    def _aimed(self, now: Floats, before: Floats, known: NDArray[np.bool_]) -> Floats:
-        """The target speed [B] of the ego: the one of the table that explains its last two speeds."""
-        kept = (1 - GAIN_SPEED / self.config.simulation_frequency) ** self.config.substeps
-        wanted = np.where(known, (now - before * kept) / (1 - kept), now)
-        table = np.array(self.config.target_speeds)
-        if self.action_type == "continuous":
-            return now
-        return np.asarray(table[np.abs(wanted[:, None] - table).argmin(1)], dtype=np.float64)
+    def believed(self, fields: Floats, count: Integers, before: TensorDictBase, *, steps: Integers) -> TensorDict:
+        """The belief [B] with cars [B, N, 8], of which the first `count` [B] are known, after `steps` [B] decisions."""
+        cars = {name: torch.from_numpy(np.ascontiguousarray(fields[..., place])) for place, name in enumerate(FIELDS)}
+        road = {name: before[name] for name in ROAD}
+        numbers = {"count": count, "steps": steps}
+        rest = {name: torch.from_numpy(np.array(values, dtype=np.int64)) for name, values in numbers.items()}
+        return TensorDict({**cars, **road, **rest}, batch_size=[len(fields)])
 
     def roll(self, belief: TensorDictBase, plans: Tensor) -> Forecast:
         bodies, episodes = self.placed(belief)
@@ -146,28 +118,48 @@ class RoadsDynamics(Dynamics):
             progress,
             NOTHING,
         )
+        # Who arrives is given the progress of all steps that are left, beyond the plan.
+        progress = np.minimum(progress, np.float32(shape[2]))
         return Forecast(torch.from_numpy(failed), torch.from_numpy(crashed), torch.from_numpy(progress))
 
     def rehearsal(self, belief: TensorDictBase, copies: int) -> Rehearsal:
         return RoadsRehearsal(self, belief, copies)
 
     def placed(self, belief: TensorDictBase) -> tuple[NDArray[np.void], NDArray[np.void]]:
-        """Bodies [B, V] and episodes [B] that begin with a belief."""
+        """Bodies [B, N + 1] and episodes [B] that begin with a belief; the last body is for an obstacle."""
         counts = belief["count"].numpy()
-        bodies = np.zeros((len(counts), self.config.observed_vehicles), dtype=BODY)
+        bodies = np.zeros((len(counts), self.slots + 1), dtype=BODY)
         episodes = np.zeros(len(counts), dtype=EPISODE)
-        episodes["network"] = belief["network"].numpy()
-        episodes["sensor_range"] = belief["sensor_range"].numpy()
-        episodes["cars"] = episodes["bodies"] = bodies.shape[1]
+        for name in ("network", "goal", "sensor_range", "steps"):
+            episodes[name] = belief[name].numpy()
+        episodes["cars"], episodes["arrivals"] = counts, NEVER
+        episodes["frames"] = self._begin + episodes["steps"] * self.config.substeps
         episodes["pace"] = self.roads["lanes"]["speed_limit"][episodes["network"], 0]
-        episodes["ahead"] = belief["x"].numpy()[:, 0]
         fields = np.stack([belief[name].numpy() for name in FIELDS], -1)
-        place_batch(self.roads, episodes, np.ascontiguousarray(fields), counts, bodies, self.parameters)
+        guesses = self._routes()
+        place_batch(
+            self.roads, episodes, fields, self._own(belief), guesses, self.changes_lanes, bodies, self.parameters
+        )
         return bodies, episodes
+
+    def _routes(self) -> Integers:
+        """[R, L] the routes that are guessed of other cars, by network and lane; made when they are first needed."""
+        if self._guesses is None:
+            self._guesses = np.full((len(self.roads), MOST_LANES), -1)
+            if self.config.task in DESTINATIONS:
+                guess_routes(self.roads, *DESTINATIONS[self.config.task], self._guesses)
+        return self._guesses
+
+    def _own(self, belief: TensorDictBase) -> Integers:
+        """[B, L] the route of the ego from each lane; -1 without one."""
+        goal = belief["goal"].numpy()[:, None]
+        if self.config.task not in DESTINATIONS or self.config.task == TaskKind.EXIT:
+            return np.full((len(goal), MOST_LANES), -1)
+        return np.arange(MOST_LANES) * DESTINATIONS[self.config.task][0] + goal
 
 
 class RoadsRehearsal(Rehearsal):
-    """Copies of straight roads that start from beliefs.
+    """Copies of roads that start from beliefs.
 
     Args:
         dynamics: the rules of motion.

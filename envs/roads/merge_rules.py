@@ -23,15 +23,21 @@ CONTINUOUS, IDM = int(Kind.CONTINUOUS), int(Kind.IDM)
 
 
 @inner
+def obstacle_place(road: Road) -> tuple[float, float]:
+    """Where the obstacle is, at the end of the ramp."""
+    edge = road.edges[road.lanes[road.spots[FIRST]].edge + 1]
+    end = road.lanes[edge.first + edge.lanes - 1]
+    return position(end, end.length, 0.0)
+
+
+@inner
 def put_ramp(road: Road, bodies: Bodies, episode: Episode, place: float) -> None:
     """The car on the ramp, `place` m from its beginning, and the obstacle at the end of the ramp."""
     x, y = position(road.lanes[road.spots[RAMP]], place, 0.0)
     put_body(road, bodies[episode.cars], IDM, x, y, 0.0, RAMP_SPEED)
     bodies[episode.cars].target_speed = RAMP_TARGET
     episode.cars += 1
-    edge = road.edges[road.lanes[road.spots[FIRST]].edge + 1]
-    end = road.lanes[edge.first + edge.lanes - 1]
-    x, y = position(end, end.length, 0.0)
+    x, y = obstacle_place(road)
     put_obstacle(road, bodies[episode.cars], x, y)
     episode.bodies = episode.cars + 1
 

@@ -38,6 +38,7 @@ class TwoWayWorld(RoadsWorld):
     name: ClassVar[str] = TWO_WAY_V1.world
     axes: ClassVar[Axes] = TWO_WAY
     grid: ClassVar[str] = TWO_WAY_V1.name
+    lane_changes: ClassVar[bool] = False
     home: ClassVar[Cell] = TWO_WAY.cell(density=1.0, oncoming=1.0)
     rules: ClassVar[Mapping[str, Any]] = {"task": TaskKind.TWO_WAY, "progress": Measure.LANE, "reference_speed": 30.0}
 

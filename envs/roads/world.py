@@ -7,10 +7,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from cavbench.driving import Control, Driver, DrivingFacts, DrivingWorld, Features, Kinematics
+from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS
 from cavbench.envs.roads.config import RoadsConfig, Scene
 from cavbench.envs.roads.shape import drawn
+from cavbench.envs.roads.state import ViewKind
 from cavbench.envs.weather import WEATHERS
 from cavbench.scenarios import Cell
 
@@ -47,6 +48,8 @@ class RoadsWorld(DrivingWorld):
     """A cell of this world, for checks that do not depend on it."""
     rules: ClassVar[Mapping[str, Any]]
     """The arguments of `RoadsConfig` that name the task, its traffic and its progress."""
+    lane_changes: ClassVar[bool] = True
+    """Whether the other cars change lanes."""
     start_speed: ClassVar[float | None] = None
     """The ego's speed at the start in m/s, if it drives on straight parallel lanes, so that a policy can predict its motion."""
 
@@ -136,3 +139,11 @@ class RoadsWorld(DrivingWorld):
         from cavbench.envs.roads.environment import RoadsEnv
 
         return RoadsEnv(self.config(cells, control))
+
+    def dynamics(self, cells: Sequence[Cell], action_type: ActionType) -> Dynamics | None:
+        """See `cavbench.driving.DrivingWorld.dynamics`. None for a world that observes no rows of cars."""
+        # Imported here because it loads torch and numba, which `bench list` must not load.
+        from cavbench.envs.roads.foresight import RoadsDynamics
+
+        config = self.config(cells, Control(action_type=action_type))
+        return RoadsDynamics(config, changes_lanes=self.lane_changes) if config.view == ViewKind.ROWS else None

@@ -53,17 +53,13 @@ class Cars:
     def __init__(self, encoder: Encoder, low: Tensor, high: Tensor) -> None:
         self.encoder, self.presence = encoder, low[:, 1:, :1]
         self.ego, self.cars = (low[:, 0, 1:], high[:, 0, 1:]), (low[:, 1:], high[:, 1:])
-        own = affine(encoder.ego.weight, None, self.ego)
-        hidden = affine(encoder.car.weight, encoder.car.bias, self.cars)
-        self.hidden = hidden[0] + own[0].unsqueeze(1), hidden[1] + own[1].unsqueeze(1)
+        self.hidden, by_interval = of_cars(encoder, self.ego, self.cars)
         self.lines = relu(*self.hidden)
-        by_interval = affine(encoder.pair.weight, encoder.pair.bias, (self.hidden[0].relu(), self.hidden[1].relu()))
         self.by_interval = self._present(by_interval)
         self.largest = largest(*self._present(self._responses(by_interval)))
 
     def interval(self) -> Interval:
-        low, high = (bound.amax(1).relu() for bound in self.by_interval)
-        return torch.cat((self.ego[0], low), -1), torch.cat((self.ego[1], high), -1)
+        return pooled(self.ego, self.by_interval)
 
     def lower(self, weight: Tensor) -> Tensor:
         weight = weight.expand(len(self.presence), *weight.shape[-2:])
@@ -102,6 +98,26 @@ class Cars:
 
     def _present(self, bounds: Interval) -> Interval:
         return bounds[0] * self.presence, bounds[1] * self.presence
+
+
+def of_cars(encoder: Encoder, ego: Interval, cars: Interval) -> tuple[Interval, Interval]:
+    """Bounds by intervals of the sums before the first ReLU, and of the responses of all cars, [N, C, K] each.
+
+    Args:
+        encoder: the encoder.
+        ego: bounds of the ego's row without its presence, [N, F - 1] each.
+        cars: bounds of the other rows, [N, C, F] each.
+    """
+    own = affine(encoder.ego.weight, None, ego)
+    hidden = affine(encoder.car.weight, encoder.car.bias, cars)
+    hidden = hidden[0] + own[0].unsqueeze(1), hidden[1] + own[1].unsqueeze(1)
+    return hidden, affine(encoder.pair.weight, encoder.pair.bias, (hidden[0].relu(), hidden[1].relu()))
+
+
+def pooled(ego: Interval, responses: Interval) -> Interval:
+    """Bounds of the encoder's output, from those of the ego's row and of the responses of the cars that are there."""
+    low, high = (bound.amax(1).relu() for bound in responses)
+    return torch.cat((ego[0], low), -1), torch.cat((ego[1], high), -1)
 
 
 def affine(weight: Tensor, bias: Tensor | None, box: Interval) -> Interval:
