@@ -12,6 +12,7 @@ from torch import Tensor
 from cavbench.attacks.driving.driven import (
     LANE_WIDTH,
     OVERTAKING,
+    has_room,
     lane_centre,
     orders,
     room,
@@ -62,14 +63,18 @@ class BoxIn(DrivingAttack):
         ego, lane = view.of_car(torch.zeros_like(cars[:, 0])), lane_centre(view.y[:, 0])
         given = Orders.none(view)
         for role, (side, ahead) in enumerate(PLACES[: cars.shape[1]]):
-            lost = view.of_car(cars[:, role]).x.abs() > REACH
+            # Beside the road there is no place.
+            on_road = (lane + side >= 0) & (lane + side <= LANE_WIDTH * (view.lanes[:, 0] - 1))
+            lost = (view.of_car(cars[:, role]).x.abs() > REACH)
             cars[:, role] = torch.where(lost, 0, cars[:, role])
             cars[:, role] = torch.where(cars[:, role] > 0, cars[:, role], self._nearest(view, lane + side, ahead, cars))
             car = view.of_car(cars[:, role])
             place = ahead * room(ego.speed, bounds)
             level = ego.speed + (NEARING * (place - car.x)).clamp(-OVERTAKING, OVERTAKING)
             slow = torch.where(car.x >= place, level.clamp(max=self.slowest), level) if ahead else level
-            one = orders(view, cars[:, role], towards(car.speed, slow, bounds), lane + side)
+            free = has_room(view, cars[:, role], lane + side, bounds)
+            y = torch.where(free, lane + side, lane_centre(car.y))
+            one = orders(view, cars[:, role], towards(car.speed, slow, bounds), y)
             given = given.joined(one)
         oracle.order(given)
         return observation, TensorDict({"cars": cars}, batch_size=state.batch_size)
