@@ -35,12 +35,13 @@ NEARING = 0.3
 class BoxIn(DrivingAttack):
     """Drives up to three cars: one ahead of the victim that slows down, and one on each side of it that keeps level with it.
 
-    With one car it drives the one ahead, with two also the one on the left. It shows the truth and asks the victim nothing.
+    With one car it drives the one ahead, with two also the one on the left. A car changes lane only while there is room for it.
+    It shows the truth and asks the victim nothing.
 
     Distance: the set `traffic` of the threat model; `threat.traffic.cars` says how many cars it drives.
 
     Args:
-        slowest: speed in m/s to which the car ahead slows down, at least 0 (default 12).
+        slowest: speed in m/s to which the car ahead slows down, at least 0 (default 12); for a slower victim it slows down more.
 
     Shapes: observation [B, V, F] in, the same out. Queries: none.
     """
@@ -63,15 +64,14 @@ class BoxIn(DrivingAttack):
         ego, lane = view.of_car(torch.zeros_like(cars[:, 0])), lane_centre(view.y[:, 0])
         given = Orders.none(view)
         for role, (side, ahead) in enumerate(PLACES[: cars.shape[1]]):
-            # Beside the road there is no place.
-            on_road = (lane + side >= 0) & (lane + side <= LANE_WIDTH * (view.lanes[:, 0] - 1))
-            lost = (view.of_car(cars[:, role]).x.abs() > REACH)
+            lost = view.of_car(cars[:, role]).x.abs() > REACH
             cars[:, role] = torch.where(lost, 0, cars[:, role])
             cars[:, role] = torch.where(cars[:, role] > 0, cars[:, role], self._nearest(view, lane + side, ahead, cars))
             car = view.of_car(cars[:, role])
             place = ahead * room(ego.speed, bounds)
             level = ego.speed + (NEARING * (place - car.x)).clamp(-OVERTAKING, OVERTAKING)
             slow = torch.where(car.x >= place, level.clamp(max=self.slowest), level) if ahead else level
+            # The world asks for room when a manoeuvre begins; the victim may have come beside the car since.
             free = has_room(view, cars[:, role], lane + side, bounds)
             y = torch.where(free, lane + side, lane_centre(car.y))
             one = orders(view, cars[:, role], towards(car.speed, slow, bounds), y)
