@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import ClassVar
 
 import torch
-from annotated_types import Interval
 from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench import zoo
 from cavbench.attacks.driving.rival_seat import empty, orders, seated, seen, told
-from cavbench.attacks.driving.rival_training import Duel, train
+from cavbench.attacks.driving.rival_training import Duel, Lessons, train
 from cavbench.core.contracts import Access, Progress, Trained
-from cavbench.core.ranges import Count, NotNegative, Positive, Share, Width
 from cavbench.driving import (
     DrivingAttack,
     DrivingDefense,
@@ -33,7 +31,7 @@ from cavbench.scenarios import SeedBlock
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rival(DrivingAttack):
+class Rival(Lessons, DrivingAttack):
     """Drives cars of the traffic by a policy that was trained against this victim with PPO (Schulman et al. 2017).
 
     `bench train` drives many episodes at once, in which the defended victim decides at every frame. Every driven car has the same
@@ -70,20 +68,6 @@ class Rival(DrivingAttack):
     joint: ClassVar[bool] = True
     learns: ClassVar[bool] = True
 
-    cars: Annotated[int, Interval(ge=1, le=50)] = 1
-    repeat: Count = 5
-    decisions: Count = 400_000
-    hidden: Width = 64
-    crash: NotNegative = 200.0
-    gamma: Share = 0.97
-    trace: Share = 0.9
-    copies: Count = 40
-    rollout: Count = 32
-    epochs: Count = 4
-    batch: Count = 1024
-    learning_rate: Positive = 1e-3
-    clip: Annotated[float, Interval(gt=0, lt=1)] = 0.2
-    entropy: NotNegative = 0.01
     trained_in: str = ""
 
     def zoo_name(self, victim: DrivingVictim) -> str:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import Annotated
 
 import torch
+from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
@@ -14,17 +16,35 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cavbench.attacks.driving.rival_seat import ACTIONS, FEATURES, empty, orders, seated, seen, told
+from cavbench.core.ranges import Count, NotNegative, Positive, Share, Width
 from cavbench.driving import Policy, State
 from cavbench.driving.sets import Traffic
 from cavbench.driving.traffic import View
 from cavbench.driving.victims.logits import Logits
 from cavbench.driving.victims.networks import QPolicy, StateValue
 
-if TYPE_CHECKING:
-    from cavbench.attacks.driving.rival import Rival
-
 LEAST_RATE = 0.05
 """The learning rate falls to this share of its beginning."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lessons:
+    """How the driver is trained; the parameters of `cavbench.attacks.driving.rival.Rival`."""
+
+    cars: Annotated[int, Interval(ge=1, le=50)] = 1
+    repeat: Count = 5
+    decisions: Count = 400_000
+    hidden: Width = 64
+    crash: NotNegative = 200.0
+    gamma: Share = 0.97
+    trace: Share = 0.9
+    copies: Count = 40
+    rollout: Count = 32
+    epochs: Count = 4
+    batch: Count = 1024
+    learning_rate: Positive = 1e-3
+    clip: Annotated[float, Interval(gt=0, lt=1)] = 0.2
+    entropy: NotNegative = 0.01
 
 
 class Duel:
@@ -36,7 +56,7 @@ class Duel:
         recipe: how the driver is trained.
     """
 
-    def __init__(self, env: EnvBase, victim: Policy, recipe: Rival) -> None:
+    def __init__(self, env: EnvBase, victim: Policy, recipe: Lessons) -> None:
         self.env, self.victim, self.recipe, self.bounds = env, victim, recipe, Traffic(cars=recipe.cars)
         self.batch, self.begun = int(env.batch_size[0]), 0
         self.td: TensorDictBase = env.reset()
@@ -132,7 +152,7 @@ def collected(duel: Duel, student: Student, decisions: int) -> TensorDict:
 class Student:
     """The networks, the loss and the optimiser: TorchRL's ClipPPOLoss and generalised advantages (Schulman et al. 2017, 2016)."""
 
-    def __init__(self, recipe: Rival) -> None:
+    def __init__(self, recipe: Lessons) -> None:
         self.recipe = recipe
         self.policy = QPolicy(FEATURES, ACTIONS, recipe.hidden)
         with torch.no_grad():
