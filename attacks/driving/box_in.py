@@ -12,6 +12,7 @@ from torch import Tensor
 from cavbench.attacks.driving.driven import (
     LANE_WIDTH,
     OVERTAKING,
+    has_room,
     lane_centre,
     orders,
     room,
@@ -34,12 +35,13 @@ NEARING = 0.3
 class BoxIn(DrivingAttack):
     """Drives up to three cars: one ahead of the victim that slows down, and one on each side of it that keeps level with it.
 
-    With one car it drives the one ahead, with two also the one on the left. It shows the truth and asks the victim nothing.
+    With one car it drives the one ahead, with two also the one on the left. A car changes lane only while there is room for it.
+    It shows the truth and asks the victim nothing.
 
     Distance: the set `traffic` of the threat model; `threat.traffic.cars` says how many cars it drives.
 
     Args:
-        slowest: speed in m/s to which the car ahead slows down, at least 0 (default 12).
+        slowest: speed in m/s to which the car ahead slows down, at least 0 (default 12); for a slower victim it slows down more.
 
     Shapes: observation [B, V, F] in, the same out. Queries: none.
     """
@@ -69,7 +71,10 @@ class BoxIn(DrivingAttack):
             place = ahead * room(ego.speed, bounds)
             level = ego.speed + (NEARING * (place - car.x)).clamp(-OVERTAKING, OVERTAKING)
             slow = torch.where(car.x >= place, level.clamp(max=self.slowest), level) if ahead else level
-            one = orders(view, cars[:, role], towards(car.speed, slow, bounds), lane + side)
+            # The world asks for room when a manoeuvre begins; the victim may have come beside the car since.
+            free = has_room(view, cars[:, role], lane + side, bounds)
+            y = torch.where(free, lane + side, lane_centre(car.y))
+            one = orders(view, cars[:, role], towards(car.speed, slow, bounds), y)
             given = given.joined(one)
         oracle.order(given)
         return observation, TensorDict({"cars": cars}, batch_size=state.batch_size)

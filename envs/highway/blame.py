@@ -45,7 +45,7 @@ def blame(
     rows = np.flatnonzero(crashed)
     if not len(rows):
         return found
-    own = replace(config, cells=tuple(config.cells[row] for row in rows), driver="agent")
+    own = replace(config, cells=tuple(config.cells[row] for row in rows))
     ends = decisions[rows]
     held = max(1, round(HELD_S * config.policy_frequency))
     # The planner chooses in every `held`-th decision.
@@ -72,6 +72,8 @@ def _again(
     """
     engine = HighwayEngine(config)
     engine.reset(np.arange(len(rows)), deeds.seeds[rows])
+    # Where the world is at the wheel, it does not do what the victim decides.
+    planner = ClairvoyantPlanner(engine) if config.driver == "clairvoyant" else None
     kept = Moment(engine.vehicles.copy(), engine.order.copy(), engine.episodes.copy())
     room = np.full(len(rows), np.nan)
     for step in range(int(ends.max())):
@@ -81,7 +83,7 @@ def _again(
         before = engine.vehicles.copy()
         engine.order_cars(orders[:, step])
         room = np.where(step < ends, _room(before, engine.vehicles, room), room)
-        engine.step(deeds.actions[step][rows])
+        engine.step(deeds.actions[step][rows] if planner is None else planner.actions())
     return kept, room
 
 

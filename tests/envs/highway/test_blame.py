@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -22,12 +23,12 @@ from cavbench.envs.highway.engine import HighwayEngine
 BATCH = 12
 BOUNDS = Traffic(cars=1, braking=9.0, gap=0.0, headway=0.0, closing=80.0, lateral_speed=4.0)
 CONFIG = HighwayConfig(cells=(AXES.cell(lanes=3, density=1.0),) * BATCH, traffic=BOUNDS)
-FASTER = 3
+FASTER, SLOWER = 3, 4
 
 
-def driven(action: int, after: int) -> tuple[Deeds, np.ndarray, np.ndarray]:
+def driven(action: int, after: int, config: HighwayConfig = CONFIG) -> tuple[Deeds, np.ndarray, np.ndarray]:
     """Episodes in which the ego only does `action`, and the nearest car ahead cuts in and brakes from decision `after` on."""
-    engine = HighwayEngine(CONFIG)
+    engine = HighwayEngine(config)
     seeds = np.arange(BATCH) + 500
     engine.reset(np.arange(BATCH), seeds)
     deeds, actions = Deeds(seeds), np.full(BATCH, action)
@@ -55,6 +56,18 @@ def test_tailgating_into_a_braking_car_is_avoidable() -> None:
     assert found[AVOIDABLE][crashed].mean() > 0.7
     assert set(found[AVOIDABLE_IDM][crashed]) <= {0.0, 1.0}
     assert np.nanmin(found[ROOM]) >= 0
+
+
+def test_what_a_victim_decides_that_the_world_drives_is_not_repeated() -> None:
+    # IDM is at the wheel, so the decisions change nothing.
+    config = replace(CONFIG, driver="idm")
+    deeds, decisions, crashed = driven(FASTER, 30, config)
+    other, *same = driven(SLOWER, 30, config)
+    assert crashed.any()
+    np.testing.assert_array_equal(same, (decisions, crashed))
+    first, second = (blame(config, one, decisions, crashed) for one in (deeds, other))
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, second[name])
 
 
 def test_a_crash_right_at_the_start_is_judged_from_the_first_decision() -> None:
