@@ -2,8 +2,9 @@
 
     python benchmarks/sumo_speed.py [--crossing] [--batch 16] [--seconds 5] [--lanes 2] [--density 1] [--vehicles 20]
 
-With `--crossing` it is `sumo_crossing`. Whole episodes of a car that keeps its lane and speed, or of the rule-based driver, resets included; a finished episode starts
-again at once. Compilation and the start of SUMO are not counted. It needs `pip install 'cavbench[sumo]'`.
+With `--crossing` it is `sumo_crossing`. Whole episodes of a car that keeps its lane and speed, or of the rule-based driver,
+resets included; a finished episode starts again at once. Compilation and the start of SUMO are not counted.
+It needs `pip install 'cavbench[sumo]'`.
 """
 
 from __future__ import annotations

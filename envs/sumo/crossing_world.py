@@ -53,16 +53,13 @@ class SumoCrossingWorld(SumoTraffic):
 
     def facts_at(self, cell: Cell) -> DrivingFacts:
         """The facts in a cell: with the lanes of its road."""
-        ahead = [(4.0 * lane, 1) for lane in range(cell.lanes)] + [
-            (-4.0 * (lane + 1), -1) for lane in range(cell.lanes)
-        ]
-        along = [((MIDDLE - way * LENGTH, y), (MIDDLE + way * LENGTH, y)) for y, way in ahead]
+        ways = [(1, LANE_WIDTH * lane) for lane in range(cell.lanes)]
+        ways += [(-1, -LANE_WIDTH * (lane + 1)) for lane in range(cell.lanes)]
+        along = [((MIDDLE - way * LENGTH, y), (MIDDLE + way * LENGTH, y)) for way, y in ways]
         # The left edge of the ego's lanes goes through the middle of the crossing.
         middle = -LANE_WIDTH / 2
-        across = [
-            ((MIDDLE + way * LANE_WIDTH / 2, middle + way * LENGTH), (MIDDLE + way * LANE_WIDTH / 2, middle - way * LENGTH))
-            for way in (1, -1)
-        ]
+        sides = [(MIDDLE + way * LANE_WIDTH / 2, middle + way * LENGTH, middle - way * LENGTH) for way in (1, -1)]
+        across = [((x, begin), (x, end)) for x, begin, end in sides]
         return replace(self.facts, lanes=tuple(LaneShape(width=LANE_WIDTH, line=line) for line in (*along, *across)))
 
     def scene(self) -> Scene:
