@@ -14,8 +14,8 @@ from cavbench.envs.sumo.roads import Road, edge
 
 LENGTH = 900.0
 """Of each of the four roads, in m from the middle of the crossing: farther than a car drives in an episode, at 40 m/s."""
-MIDDLE = LENGTH
-"""x of the crossing: highway's road begins at 0."""
+MIDDLE = 120.0
+"""x of the crossing, so that the ego, which starts before it, is at x > 0: there highway's lanes begin."""
 SPEED_LIMIT = 13.89
 """m/s: 50 km/h."""
 SIDES = {"west": (-1, 0), "east": (1, 0), "south": (0, -1), "north": (0, 1)}

@@ -22,12 +22,13 @@ if TYPE_CHECKING:
 
 FEATURES = Features(
     names=("x", "y", "vx", "vy"),
-    low=(-100.0, -100.0, -30.0, -30.0),
-    high=(100.0, 100.0, 30.0, 30.0),
+    low=(-300.0, -100.0, -30.0, -30.0),
+    high=(300.0, 100.0, 30.0, 30.0),
     units=UNITS,
     floors=FLOORS,
 )
-"""Cars come from all sides: x and y have the same range, and so have their speeds."""
+"""Cars come from all sides, so their speeds along and across have the same range. x also
+says how far the ego is from the crossing, which is at 120 m."""
 
 
 @dataclass(frozen=True, kw_only=True)

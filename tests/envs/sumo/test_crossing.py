@@ -115,7 +115,7 @@ def test_cars_turn_and_cross_where_the_ego_can_meet_them_and_are_seen_with_their
         assert moved == pytest.approx(before["speed"] * np.sin(before["heading"]), abs=0.5)
         rows = made.observation[0, 1:]
         shown = rows[rows[:, 0] > 0]
-        place = shown[:, 1:3] * 100
+        place = shown[:, 1:3] * np.array([300, 100])
         ego = made.vehicles[0, 0]
         distance = np.abs(place - np.array([after["x"] - ego["x"], after["y"] - ego["y"]])).max(1)
         row = int(distance.argmin())
@@ -159,6 +159,18 @@ def test_results_do_not_depend_on_the_place_in_the_batch_nor_on_processes() -> N
 def test_a_cell_that_there_is_not_is_one_line() -> None:
     with pytest.raises(ValueError, match=r"^rule must be one of yield, allway_stop, got first$"):
         CROSSING.cell(**dict(WORLD.home) | {"rule": "first"})
+
+
+@needs_sumo
+def test_the_ego_sees_how_far_the_crossing_is() -> None:
+    with engine(8) as made:
+        made.reset(np.arange(8), np.arange(SEED, SEED + 8))
+        for _ in range(WORLD.max_steps):
+            made.step(np.full(8, IDLE))
+            seen = made.observation[:, 0, 1] * 300
+            assert seen == pytest.approx(made.vehicles["x"][:, 0], abs=0.01)
+        # At 10 m/s it is far behind the crossing at the end, where it did not crash.
+        assert seen.max() > MIDDLE + 100
 
 
 @needs_sumo
