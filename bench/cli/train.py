@@ -72,8 +72,8 @@ def train(asked: TrainConfig, console: Console) -> None:
         line = f"{recipe.name}, seed {seed}: trained in {seconds:.0f} s, saved as {path}"
         console.print(Text(line), soft_wrap=True)
     use = recipe.use if config is asked else _use(config, component, asked.defense)
-    if getattr(component, "drives", False):
-        use += " threat.traffic.cars=1"
+    for word in getattr(component, "forges", ())[:1]:
+        use += f" threat.{word}"
     console.print(Text(f"To use it: {use}"), soft_wrap=True)
 
 

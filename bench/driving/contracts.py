@@ -282,6 +282,10 @@ class DrivingAttack(Attack):
     drives: ClassVar[bool] = False
     """Whether it drives cars of the traffic (`Oracle.order`); the threat model must allow it some (`threat.traffic.cars`)."""
 
+    @property
+    def forges(self) -> tuple[str, ...]:
+        return ("traffic.cars=1",) if self.drives else ()
+
     def lacks(self, world: DrivingWorld) -> str:
         if self.drives and "traffic" not in world.offers:
             return "it drives cars of the traffic, which this world does not allow"

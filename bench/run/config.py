@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from cavbench.core import registry
+from cavbench.core import registry, sets
 from cavbench.core.options import Options, configured
 from cavbench.core.pair import Chosen, Pair, check_track
 from cavbench.core.registry import KINDS, Kind
@@ -48,8 +48,9 @@ class TrainConfig:
     def __post_init__(self) -> None:
         check_seeds(self.seeds)
         check_track(self.victim, self.defense, self.attack, self.world)
-        # A pair checks that the attack fits the victim.
-        threat = self.victim.component.threat()
+        # A pair checks that the attack fits the victim. What the attack needs is allowed where it is trained.
+        model, attack = self.victim.component.threat, self.attack.component
+        threat = model(**sets.read(model, list(attack.forges) if attack.learns else []))
         Pair(attack=self.attack, defense=self.defense, victim=self.victim, world=self.world, threat=threat)
 
     @property

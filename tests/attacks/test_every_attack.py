@@ -13,10 +13,13 @@ from cavbench.attacks.driving.bias import Bias
 from cavbench.attacks.driving.noise import Noise
 from cavbench.attacks.driving.pgd import PGD
 from cavbench.attacks.driving.zo import ZOSignSGD
+from cavbench.core import registry
 from cavbench.driving import ActionType, DrivingAttack, ObservationThreat
 from cavbench.driving.threat import Norm
 from tests.attacks.driving.victims import FEATURES, observations, perturb, victim
 from tests.checks.rules import broken, built_in, each
+from tests.cli.test_cli import assert_one_line
+from tests.command import Bench
 
 OWN_TESTS = {"art", "given_patch", "none"}
 """`art` needs a choice: test_art.py checks some. `given_patch` needs a picture: test_given_patch.py has one. `none` answers
@@ -54,6 +57,12 @@ norms: st.SearchStrategy[Norm] = st.sampled_from(("relative", "linf"))
 @each(sorted(ATTACKS))
 def test_it_keeps_the_rules(name: str) -> None:
     assert broken("attack", name) == {}
+
+
+@each(sorted(name for name in ATTACKS if getattr(registry.load("attack", name), "drives", False)))
+def test_an_attack_that_drives_cars_is_refused_before_anything_is_driven(name: str, bench: Bench) -> None:
+    said = bench("run", f"attack={name}", "victim=dqn", "lanes=3", "seeds=0")
+    assert_one_line(said, f"attack '{name}' can do nothing under this threat model: allow it threat.traffic.cars=1")
 
 
 @settings(max_examples=80, deadline=None)

@@ -134,7 +134,7 @@ def test_it_is_trained_then_run_then_replayed(bench: Bench, tmp_path: Path, monk
     assert "threat.traffic.cars=1" in said.out
     nobody = bench(*run)
     assert nobody.code != 0
-    assert "the threat model allows none: threat.traffic.cars=1" in nobody.err
+    assert "can do nothing under this threat model: allow it threat.traffic.cars=1" in nobody.err
     assert bench(*run, "threat.traffic.cars=1").code == 0
     records = reading.read(tmp_path / "results", track=track("driving"))
     attacked = [row for row in records.to_pylist() if row["attack"] == "rival"]
