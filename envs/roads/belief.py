@@ -359,7 +359,6 @@ def track(
     episode: Episode,
     rows: Floats,
     clipped: NDArray[np.int8],
-    own: Integers,
     parameters: Parameters,
     trial: Bodies,
     taken: NDArray[np.bool_],
@@ -398,7 +397,6 @@ def track_batch(
     episodes: NDArray[np.void],
     rows: Floats,
     clipped: NDArray[np.int8],
-    own: Integers,
     parameters: NDArray[np.void],
     fields: Floats,
 ) -> None:
@@ -409,7 +407,6 @@ def track_batch(
         bodies, episodes: from `place_batch`; changed.
         rows: [B, V, 5] measurements in physical units: presence, x, y, vx, vy; from the second row on, from the ego.
         clipped: [B, V, 4] whether x, y, vx, vy are at the upper (1) or lower (-1) edge of their range, or neither (0).
-        own: [B, L] the route of the ego from each lane.
         fields: the output.
     """
     given, corners, trial = parameters[0], np.empty((2, 5, 2)), np.empty_like(bodies[0][:1])
@@ -417,7 +414,7 @@ def track_batch(
     for number in range(episodes.size):
         episode, cars = episodes[number], bodies[number]
         road = roads[episode.network]
-        track(road, cars, episode, rows[number], clipped[number], own[number], given, trial, taken, corners)
+        track(road, cars, episode, rows[number], clipped[number], given, trial, taken, corners)
         fields[number] = 0.0
         for car in range(episode.cars):
             body, place = cars[car], fields[number, car]

@@ -81,8 +81,7 @@ class RoadsDynamics(Dynamics):
         bodies, episodes = self.placed(before)
         episodes["noise_sigma"] = before["noise_sigma"].numpy()
         fields = np.zeros((len(rows), self.slots, len(FIELDS)))
-        own = self._own(before)
-        track_batch(self.roads, bodies, episodes, rows, clipped, own, self.parameters, fields)
+        track_batch(self.roads, bodies, episodes, rows, clipped, self.parameters, fields)
         return self.believed(fields, episodes["cars"], before, steps=episodes["steps"])
 
     def believed(self, fields: Floats, count: Integers, before: TensorDictBase, *, steps: Integers) -> TensorDict:

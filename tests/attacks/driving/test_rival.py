@@ -26,21 +26,12 @@ from cavbench.records import reading
 from cavbench.run.replay import replay
 from cavbench.scenarios import SeedBlock
 from tests.attacks.driving.directors import silent
+from tests.attacks.driving.test_trained_attacks import RUN
 from tests.cli.test_cli import assert_one_line
 from tests.command import Bench
 
 SHORT = Rival(decisions=64, copies=1, rollout=8, hidden=8)
 OPTIONS = ("attack.decisions=64", "attack.copies=1", "attack.rollout=8", "attack.hidden=8")
-RUN = (
-    "lanes=3",
-    "density=1",
-    "weather=clear",
-    "episodes=2",
-    "record=0",
-    "reference=false",
-    "executor=serial",
-    "seeds=0",
-)
 ROADS = ((3, 2.0), (5, 1.0))
 
 
