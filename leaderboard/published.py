@@ -10,7 +10,7 @@ A row is a defended victim on a grid. Its records are `data/GRID/NAME.parquet`, 
 (`cavbench.leaderboard.faces`). So a new row is two new files, and no other one changes. The records of all baselines of a grid,
 which no leaderboard ranks, are one file, `data/GRID/baselines.parquet`. So are those of faults, of every
 version of their suite: `data/faults/faults.parquet`.
-Records of the suite `worlds` are read by the leaderboard over worlds alone: `data/worlds-1/NAME.parquet`, a file for all worlds.
+Records of the suite `worlds` are read by the leaderboard over worlds alone: `data/worlds-2/NAME.parquet`, a file for all worlds.
 """
 
 from __future__ import annotations

@@ -18,8 +18,11 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from cavbench.core.track import track
 from cavbench.leaderboard.job import driven
 from cavbench.leaderboard.published import HOME, publish_worlds
+from cavbench.leaderboard.ranking.methods import EACH
+from cavbench.leaderboard.ranking.methods import HOME as TRAINED_IN
 from cavbench.run.config import plan_of
 from cavbench.run.cost import spoken
 
@@ -27,15 +30,17 @@ ALWAYS = ("record=0", "executor=serial")
 
 
 def runs(table: Path) -> list[tuple[str, ...]]:
-    """The words of each run of a table: every row in its worlds, world by world."""
+    """The words of each run of a table: row by row, each in its worlds. So a job that ends early leaves whole rows."""
     found = tomllib.loads(table.read_text(encoding="utf-8"))
     made = []
-    for world, cells in found["world"].items():
-        for row in found["row"]:
-            if world in row.get("worlds", (world,)):
-                # A row may choose another attack.
-                words = dict(word.split("=", 1) for word in (*found["words"], *cells["words"], *row["words"]))
-                made.append((f"world={world}", *(f"{key}={value}" for key, value in words.items())))
+    for row in found["row"]:
+        for world in row.get("worlds", found["world"]):
+            # A row may choose another attack.
+            given = (*found["words"], *found["world"][world]["words"], *row["words"])
+            words = dict(word.split("=", 1) for word in given)
+            if row.get("trained") == EACH and world != track("driving").world:
+                words[f"victim.{TRAINED_IN}"] = world
+            made.append((f"world={world}", *(f"{key}={value}" for key, value in words.items())))
     return made
 
 

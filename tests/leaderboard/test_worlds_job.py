@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib.resources import files
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,26 @@ def test_every_row_is_driven_in_each_of_its_worlds_and_each_world_has_its_refere
         )
 
 
+def test_a_row_is_whole_before_the_next_one_begins() -> None:
+    rows = [
+        " ".join(word for word in words if word.split("=")[0].startswith(("victim", "defense")))
+        for words in runs(TABLE)
+    ]
+    rows = [row.partition(" victim.trained_in=")[0] for row in rows]
+    assert [one for one, _ in groupby(rows)] == list(dict.fromkeys(rows))
+
+
+def test_a_driver_that_was_trained_in_each_world_is_the_one_of_the_world_that_it_drives_in() -> None:
+    homes = {
+        words[0].removeprefix("world="): [word for word in words if word.startswith("victim.trained_in=")]
+        for words in runs(TABLE)
+        if "victim.decisions=12000" in words
+    }
+    assert len(homes) == 8
+    assert homes.pop("highway") == []
+    assert homes == {world: [f"victim.trained_in={world}"] for world in homes}
+
+
 def test_what_a_run_costs_is_said(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     some = runs(TABLE)[:2] + runs(TABLE)[-1:]
     monkeypatch.setattr(worlds_job, "runs", lambda table: some)
@@ -43,4 +64,4 @@ def test_what_was_driven_is_published(tmp_path: Path, monkeypatch: pytest.Monkey
     )
     monkeypatch.setattr(worlds_job, "files", lambda name: tmp_path)
     assert main(["--hours", "1", "--out", str(tmp_path / "results")]) == 0
-    assert [path.stem for path in (tmp_path / "data" / "worlds-1").iterdir()] == ["dqn"]
+    assert [path.stem for path in (tmp_path / "data" / "worlds-2").iterdir()] == ["dqn"]
