@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench import zoo
-from cavbench.attacks.driving.rival_seat import empty, orders, seated, seen, told
+from cavbench.attacks.driving.rival_seat import ACTIONS, FEATURES, empty, orders, seated, seen, told
 from cavbench.attacks.driving.rival_training import Duel, Lessons, train
 from cavbench.core.contracts import Access, Progress, Trained
 from cavbench.driving import (
@@ -27,6 +27,7 @@ from cavbench.driving import (
 from cavbench.driving.sets import Traffic
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import roads
+from cavbench.errors import UserError
 from cavbench.scenarios import SeedBlock
 
 
@@ -48,14 +49,14 @@ class Rival(Lessons, DrivingAttack):
         repeat: frames for which a choice is held, at least 1 (default 5).
         decisions: decisions in the training, of all episodes together, at least 1 (default 400000).
         hidden: width of the hidden layers (default 64).
-        crash: what a crash is worth to it, in frames of full progress, at least 0 (default 200).
-        gamma: discount per decision, in [0, 1] (default 0.97).
+        crash: what a crash is worth to it, in frames of full progress, in [0, 1e6] (default 200).
+        gamma: discount per decision, in [0, 1) (default 0.97).
         trace: lambda of the advantages, in [0, 1] (default 0.9).
         copies: parallel episodes on each road of the grid, at least 1 (default 40).
         rollout: decisions of each episode between two rounds of updates, at least 1 (default 32).
         epochs: how often each decision is learned from, at least 1 (default 4).
         batch: decisions per update, at least 1 (default 1024).
-        learning_rate: rate of Adam at the beginning, above 0; it falls linearly (default 0.001).
+        learning_rate: rate of Adam at the beginning, in (0, 1]; it falls linearly (default 0.001).
         clip: largest change of a choice's probability ratio that is rewarded, in (0, 1) (default 0.2).
         entropy: weight of the entropy bonus, at least 0 (default 0.01).
         trained_in: non-default parameters of the training world; set by `bench train`.
@@ -112,4 +113,10 @@ class Rival(Lessons, DrivingAttack):
 
     def load(self, victim: DrivingVictim, defense: DrivingDefense, seed: int, facts: DrivingFacts) -> QPolicy:
         against = defense.load(victim, seed, facts).weights_sha256
-        return zoo.load(zoo.Recipe.of(victim, defense, self), seed, QPolicy, against=against)
+        network = zoo.load(zoo.Recipe.of(victim, defense, self), seed, QPolicy, against=against)
+        sizes = {name: network.shape[name] for name in ("features", "actions")}
+        if sizes != {"features": FEATURES, "actions": ACTIONS}:
+            raise UserError(
+                f"the zoo's rival of training seed {seed} is no driver of the traffic: its network has {sizes}"
+            )
+        return network

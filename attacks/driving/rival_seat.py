@@ -90,7 +90,7 @@ def seen(view: View, seats: TensorDict, bounds: Traffic) -> Tensor:
         torch.where(mirror > 0, left, right) / ACROSS,
     ]
     others = view.x.abs().index_fill(1, torch.tensor([0]), torch.inf)
-    near = others.topk(NEAR, 1, largest=False).indices
+    apart, near = others.topk(min(NEAR, others.shape[1]), 1, largest=False)
     rows = torch.zeros(batch, cars, 1 + NEAR, FEATURES)
     rows[:, :, 0] = torch.stack(first, -1)
     there = View(*(values.gather(1, near)[:, None].expand(-1, cars, -1) for values in view))
@@ -103,8 +103,8 @@ def seen(view: View, seats: TensorDict, bounds: Traffic) -> Tensor:
         (there.speed - ego.speed[..., None]) / FAST,
         mirror[..., None] * (there.y - own.y[..., None]) / ACROSS,
     ]
-    present = (there.x.abs() < 2 * REACH) & ~mine
-    rows[:, :, 1:, : len(more)] = (torch.stack(more, -1) * present[..., None]).float()
+    present = (apart < 2 * REACH)[:, None] & ~mine
+    rows[:, :, 1 : 1 + near.shape[1], : len(more)] = (torch.stack(more, -1) * present[..., None]).float()
     return rows.clamp(-4, 4)
 
 

@@ -16,15 +16,18 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from cavbench.attacks.driving.rival_seat import ACTIONS, FEATURES, empty, orders, seated, seen, told
-from cavbench.core.ranges import Count, NotNegative, Positive, Share, Width
+from cavbench.core.ranges import Count, NotNegative, Share, Width
 from cavbench.driving import Policy, State
 from cavbench.driving.sets import Traffic
 from cavbench.driving.traffic import View
 from cavbench.driving.victims.logits import Logits
 from cavbench.driving.victims.networks import QPolicy, StateValue
+from cavbench.errors import UserError
 
 LEAST_RATE = 0.05
 """The learning rate falls to this share of its beginning."""
+LEAST = 2
+"""Decisions in a round of which something can be learned: one has no advantage over others."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,14 +38,14 @@ class Lessons:
     repeat: Count = 5
     decisions: Count = 400_000
     hidden: Width = 64
-    crash: NotNegative = 200.0
-    gamma: Share = 0.97
+    crash: Annotated[float, Interval(ge=0, le=1e6)] = 200.0
+    gamma: Annotated[float, Interval(ge=0, lt=1)] = 0.97
     trace: Share = 0.9
     copies: Count = 40
     rollout: Count = 32
     epochs: Count = 4
     batch: Count = 1024
-    learning_rate: Positive = 1e-3
+    learning_rate: Annotated[float, Interval(gt=0, le=1)] = 1e-3
     clip: Annotated[float, Interval(gt=0, lt=1)] = 0.2
     entropy: NotNegative = 0.01
 
@@ -122,6 +125,9 @@ def train(duel: Duel, progress: Callable[[float, str], None]) -> tuple[QPolicy, 
     """Train a driver in `duel`; its network, the number of its decisions, and the victim's crash rate at the end.
 
     The crash rate is that of the episodes that ended in the last quarter of the training, while the driver still explored.
+
+    Raises:
+        UserError: if no car came near the victim.
     """
     recipe = duel.recipe
     student = Student(recipe)
@@ -132,6 +138,8 @@ def train(duel: Duel, progress: Callable[[float, str], None]) -> tuple[QPolicy, 
             duel.ends = duel.crashes = 0
         student.learn(collected(duel, student, recipe.rollout), 1 - number / rounds)
         progress((number + 1) / rounds, f"{duel.crashes} of {duel.ends} episodes ended in a crash")
+    if not student.learned:
+        raise UserError("there was nothing to learn for rival: no car of the traffic came near the victim")
     rate = round(duel.crashes / max(duel.ends, 1), 4)
     return student.policy, {"decisions": rounds * each, "crash_rate": rate}
 
@@ -153,7 +161,7 @@ class Student:
     """The networks, the loss and the optimiser: TorchRL's ClipPPOLoss and generalised advantages (Schulman et al. 2017, 2016)."""
 
     def __init__(self, recipe: Lessons) -> None:
-        self.recipe = recipe
+        self.recipe, self.learned = recipe, 0
         self.policy = QPolicy(FEATURES, ACTIONS, recipe.hidden)
         with torch.no_grad():
             self.policy.network.head[-1].weight.mul_(0.1)
@@ -191,6 +199,9 @@ class Student:
         with torch.no_grad():
             flat = self.advantage(experience).exclude("next").reshape(-1)
         flat = flat[flat["valid"]]
+        if len(flat) < LEAST:
+            return
+        self.learned += len(flat)
         advantage = flat["advantage"]
         flat["advantage"] = (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6)
         for _ in range(recipe.epochs):

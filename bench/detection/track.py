@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cavbench.core import registry
+from cavbench.core import registry, sets
 from cavbench.core.contracts import Progress
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Baseline, Contrast, Driven, Job, Measure, Track
@@ -298,7 +298,8 @@ class DetectionTrack(Track):
         return str(other["attack"]) if is_one else ""
 
     def allowed(self, norm: str, budget: float, facts: Mapping[str, Any]) -> str:
-        return f"a {'printable ' * (norm == 'print')}patch {100 * budget:g} % as wide as the sign"
+        norm, others = sets.split(norm)
+        return "; ".join((f"a {'printable ' * (norm == 'print')}patch {100 * budget:g} % as wide as the sign", *others))
 
     def effort(self, column: Callable[[str], NDArray[np.float64]]) -> Iterator[tuple[str, str]]:
         images, seconds = (float(column(name).mean()) for name in ("queries", "crafting_s"))

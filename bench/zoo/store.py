@@ -178,6 +178,8 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
         if begun:
             _check_start(recipe, seed, begun, network)
             tensors = _completed(tensors, begun["tensors"], network)
+        if broken := [name for name, one in tensors.items() if one.is_floating_point() and one.isnan().any()]:
+            raise ValueError(f"{broken[0]} has NaN")
         network.load_state_dict(tensors)
     except (
         SafetensorError,

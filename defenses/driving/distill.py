@@ -158,7 +158,9 @@ def labels(scores: Tensor, temperature: float) -> Tensor:
     """The teacher's probabilities [N, A] at a temperature, from its scores [N, A]; of its greedy action alone at 0."""
     if temperature == 0:
         return torch.nn.functional.one_hot(scores.argmax(-1), scores.shape[-1]).to(scores)
-    spread = scores.std(-1, keepdim=True).clamp(min=torch.finfo(scores.dtype).tiny)
+    spread = scores.std(-1, keepdim=True)
+    # Scores that are all the same have none: every action is as good.
+    spread = spread.where(spread > torch.finfo(scores.dtype).tiny, 1.0)
     return torch.softmax(SHARPNESS * scores / (spread * temperature), -1)
 
 

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from cavbench.core import sets
 from cavbench.core.track import Measure, Track
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.naming import component, defended, varying
@@ -212,10 +213,29 @@ def _one_threat(attacks: Sequence[Comparison]) -> bool:
 
 
 def _threat_words(one: Comparison, comparisons: Sequence[Comparison]) -> str:
-    """What tells the threat models of a sweep apart."""
+    """What tells the threat models of a sweep apart; of their sets only the fields that not all of them have, by short names."""
     identities = [other.identity for other in comparisons if other.is_attacked]
-    names = [name for name in (*THREAT, "grid") if len({str(each[name]) for each in identities}) > 1]
-    return "".join(f" {one.identity[name]}" for name in names)
+    common = common_sets(comparisons)
+    words = [_short(word) for word in _sets(one) if word not in common]
+    names = [name for name in (*THREAT[1:], "grid") if len({str(each[name]) for each in identities}) > 1]
+    return "".join(f" {word}" for word in (*words, *(one.identity[name] for name in names)))
+
+
+def _short(word: str) -> str:
+    """`hidden=1` of `presence.hidden=1`, so that a narrow table has room for it."""
+    key, sign, value = word.partition("=")
+    return f"{key.rpartition('.')[2]}{sign}{value}"
+
+
+def common_sets(comparisons: Sequence[Comparison]) -> list[str]:
+    """The sets that the threat models of all attacks have, each as `threat.` takes it; the perturbation set, too, is one."""
+    attacked = [_sets(one) for one in comparisons if one.is_attacked]
+    return [word for word in attacked[0] if all(word in other for other in attacked)] if attacked else []
+
+
+def _sets(one: Comparison) -> list[str]:
+    norm, others = sets.split(str(one.identity["threat_norm"]))
+    return [norm, *others]
 
 
 def _baseline_sections(comparisons: Sequence[Comparison]) -> Iterator[Section[Line]]:

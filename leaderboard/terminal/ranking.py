@@ -25,6 +25,7 @@ from cavbench.leaderboard.terminal.text import (
     BASELINE,
     CLEAN,
     MISSING,
+    allowance,
     counted,
     estimate,
     number,
@@ -124,7 +125,7 @@ def _without_rank(board: Board) -> Iterator[str]:
 
 def _title(board: Board) -> Text:
     norm, budget, access, queries, frames = board.threat
-    allowed = f"{board.grid}, {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
+    allowed = f"{board.grid}, {allowance(norm, budget)}, access {access}, {queries} queries{of_frames(frames)}"
     return Text.assemble((board.track.name, "bold"), f" in {board.world[0]}, {allowed}")
 
 

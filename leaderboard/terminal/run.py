@@ -11,14 +11,25 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from cavbench.core import sets
 from cavbench.core.track import Track, track
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.leaderboard.comparisons.naming import component, defended, varying
 from cavbench.leaderboard.comparisons.reading import read_comparisons
 from cavbench.leaderboard.ranking.remarks import comparison_remarks, run_remarks
 from cavbench.leaderboard.terminal.cells import cell_by_cell
-from cavbench.leaderboard.terminal.overview import overview
-from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
+from cavbench.leaderboard.terminal.overview import common_sets, overview
+from cavbench.leaderboard.terminal.text import (
+    ATTACKED,
+    BASELINE,
+    CLEAN,
+    MARKS,
+    allowance,
+    counted,
+    of_frames,
+    size,
+    threat,
+)
 from cavbench.statistics.episodes import step_mean
 
 SCREEN, AROUND, NOTES = 24, 7, 2
@@ -69,9 +80,8 @@ def _below(comparisons: Sequence[Comparison]) -> Iterator[Text]:
     contrast = comparisons[0].track.contrast
     if any(one.lead for one in own) and contrast and contrast.side == "victim":
         yield marks(contrast.title)
-    threats = list(dict.fromkeys(_short_threat(one) for one in own))
-    if len(threats) == 1:
-        yield Text(threats[0], style="dim")
+    if common := _common_threat(own):
+        yield Text(common, style="dim")
     for doubt in _together((found.about, found.text) for found in run_remarks(comparisons)):
         yield Text(doubt, style="bold yellow")
     said = [(_about(one, comparisons), remark) for one in comparisons for remark in _doubts(one)]
@@ -102,9 +112,16 @@ def _about(one: Comparison, comparisons: Sequence[Comparison]) -> str:
     return f"{attack}{defended(one, shown)}"
 
 
-def _short_threat(one: Comparison) -> str:
-    norm, budget, access, queries, share = (one.identity[name] for name in THREAT)
-    return f"threat: {norm} {budget:g}, access {access}, {queries} {one.track.queries_title}{of_frames(share)}"
+def _common_threat(attacks: Sequence[Comparison]) -> str:
+    """The threat model of all attacks, without the sets that only some of them have; empty where more than sets differs."""
+    common = common_sets(attacks)
+    rest = {tuple(one.identity[name] for name in THREAT[1:]) for one in attacks}
+    norms = {sets.split(str(one.identity["threat_norm"]))[0] for one in attacks}
+    if len(rest) != 1 or len(norms) != 1:
+        return ""
+    ((budget, access, queries, share),) = rest
+    allowed = allowance("+".join(common), budget)
+    return f"threat: {allowed}, access {access}, {queries} {attacks[0].track.queries_title}{of_frames(share)}"
 
 
 def marks(baseline: str) -> Text:

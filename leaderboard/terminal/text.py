@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from rich.text import Text
 
+from cavbench.core import sets
 from cavbench.leaderboard.comparisons.comparison import THREAT, Comparison
 from cavbench.statistics.estimates import Interval
 
@@ -119,9 +120,16 @@ def threat(one: Comparison) -> str:
         return "nothing is attacked"
     norm, budget, access, queries, share = (one.identity[name] for name in THREAT)
     allowed = one.track.allowed(norm, budget, one.facts)
+    plain, _ = sets.split(norm)
     return (
-        f"{norm} {budget:g}: {allowed}; access {access}, at most {queries} {one.track.queries_title}{of_frames(share)}"
+        f"{plain} {budget:g}: {allowed}; access {access}, at most {queries} {one.track.queries_title}{of_frames(share)}"
     )
+
+
+def allowance(norm: str, budget: float) -> str:
+    """What an attack may do: the perturbation set with its size, then the other sets."""
+    plain, others = sets.split(norm)
+    return ", ".join((f"{plain} {budget:g}", *others))
 
 
 def of_frames(share: float) -> str:

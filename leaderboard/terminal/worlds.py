@@ -14,7 +14,7 @@ from cavbench.leaderboard.ranking.methods import Method
 from cavbench.leaderboard.ranking.published_worlds import read_worlds
 from cavbench.leaderboard.ranking.worlds import WorldBoard, WorldRow
 from cavbench.leaderboard.terminal.layout import Column, Section, fitted
-from cavbench.leaderboard.terminal.text import ATTACKED, MISSING, estimate, number, of_frames
+from cavbench.leaderboard.terminal.text import ATTACKED, MISSING, allowance, estimate, number, of_frames
 
 MINE = "▸"
 SHARE = (
@@ -47,7 +47,7 @@ def print_worlds(boards: Sequence[WorldBoard], console: Console) -> None:
     """Print the leaderboards over worlds."""
     for board in boards:
         norm, budget, access, queries, frames = board.threat
-        allowed = f", {norm} {budget:g}, access {access}, {queries} queries{of_frames(frames)}"
+        allowed = f", {allowance(norm, budget)}, access {access}, {queries} queries{of_frames(frames)}"
         console.print(Padding(Text.assemble((f"{board.track.name} over worlds", "bold"), allowed), (1, 1)))
         console.print(Padding(fitted(_columns(board), [Section(board.rows)], console), (0, 1)))
         ranked = any(row.group for row in board.rows)

@@ -109,6 +109,15 @@ def test_left_and_right_look_the_same() -> None:
     assert seen(view, one, BOUNDS).shape == (1, 2, 1 + NEAR, FEATURES)
 
 
+@pytest.mark.parametrize("cars", [1, 2, 5])
+def test_with_few_cars_on_the_road_it_sees_the_same_as_with_more_out_of_sight(cars: int) -> None:
+    placed = [(0.0, 0.0, 20.0), (12.0, 4.0, 22.0), (30.0, 8.0, 24.0), (-8.0, 4.0, 27.0), (40.0, 0.0, 21.0)][: cars + 1]
+    many = road(*placed)
+    few = View(*(values[:, : cars + 1] for values in many))
+    rows = [seen(view, seated(view, empty(1, 1)), BOUNDS) for view in (few, many)]
+    torch.testing.assert_close(*rows, rtol=0, atol=0)
+
+
 def test_it_sees_the_victim_its_room_and_the_cars_but_itself() -> None:
     close, free = (road((0, 0, 20), (x, 4, 20), (50, 8, 20)) for x in (9.0, 30.0))
     rows = [seen(view, seated(view, empty(1, 1)), BOUNDS)[0, 0] for view in (close, free)]

@@ -7,9 +7,10 @@ from dataclasses import replace
 import pytest
 import torch
 
+from cavbench.attacks.driving import rival_training
 from cavbench.attacks.driving.rival import Rival
 from cavbench.attacks.driving.rival_seat import ACTIONS, SIDES
-from cavbench.attacks.driving.rival_training import Duel, Student, collected
+from cavbench.attacks.driving.rival_training import Duel, Student, collected, train
 from cavbench.core.pair import choose
 from cavbench.defenses.none import NoDefense
 from cavbench.driving import DrivingWorld
@@ -17,6 +18,7 @@ from cavbench.driving.sets import Traffic
 from cavbench.driving.traffic import View
 from cavbench.driving.victims.dqn import DQN
 from cavbench.envs.highway.axes import AXES
+from cavbench.errors import UserError
 
 CELLS = [AXES.cell(lanes=lanes, density=2.0) for lanes in (3, 4) for _ in range(6)]
 RECIPE = Rival(hidden=8, rollout=4, batch=64)
@@ -92,6 +94,28 @@ def test_an_update_makes_rewarded_choices_more_likely(world: DrivingWorld) -> No
     with torch.no_grad():
         after = student.policy.network(seen).softmax(-1)[:, 5].mean()
     assert after > 1.2 * before
+
+
+def test_a_training_in_which_nobody_drove_is_refused(world: DrivingWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    practice = duel(world)
+    student = Student(RECIPE)
+    before = [weight.clone() for weight in student.policy.parameters()]
+    experience = collected(practice, student, 1)
+    experience["valid"][:] = False
+    for driven in (0, 1):
+        experience["valid"][:driven] = True
+        student.learn(experience.clone(), 1.0)
+    torch.testing.assert_close(list(student.policy.parameters()), before, rtol=0, atol=0)
+    monkeypatch.setattr(rival_training, "collected", lambda *_: experience.clone())
+    with pytest.raises(UserError, match="no car of the traffic came near the victim"):
+        train(practice, lambda *_: None)
+
+
+@pytest.mark.parametrize(("name", "value"), [("gamma", 1.0), ("crash", 1e38), ("learning_rate", 1e30)])
+def test_parameters_with_which_nothing_can_be_learned_are_refused(name: str, value: float) -> None:
+    """At a discount of 1 every reward would be 0; the others overflow."""
+    with pytest.raises(ValueError, match=f"{name} must be"):
+        Rival(**{name: value})
 
 
 def test_the_view_is_that_of_the_world(world: DrivingWorld) -> None:

@@ -79,6 +79,11 @@ def test_labels_do_not_depend_on_the_scale_or_offset_of_the_scores(
     torch.testing.assert_close(labels(own, 20.0), labels(scale * own + offset, 20.0), rtol=1e-4, atol=1e-6)
 
 
+def test_scores_that_are_all_the_same_make_every_action_as_likely() -> None:
+    for score in (0.0, 0.5, 1e4):
+        torch.testing.assert_close(labels(torch.full((1, 5), score), 20.0), torch.full((1, 5), 0.2))
+
+
 @given(SCORES)
 def test_labels_soften_with_the_temperature_from_the_decision_alone_to_all_alike(scores: list[int]) -> None:
     own = torch.tensor([scores]).double()

@@ -86,7 +86,7 @@ def test_without_an_attack_there_is_nothing_to_rank() -> None:
 def test_the_document_says_whose_a_row_is() -> None:
     own, theirs = (records("zo", skill=skill) for skill in (0.6, 0.2))
     boards, comparisons = read_boards({"driving": own}, {"driving": theirs})
-    made = enveloped("leaderboard", document(boards, comparisons, None))
+    made = enveloped("beside", document(boards, comparisons, None))
     jsonschema.validate(made, schema())
     assert sorted(row["mine"] for row in made["boards"][0]["rows"]) == [False, True]
     pairs = {pair["key"]: pair["mine"] for pair in made["pairs"]}

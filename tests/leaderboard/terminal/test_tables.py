@@ -100,6 +100,26 @@ def test_the_threat_model_and_the_attacks_parameters_are_stated() -> None:
     assert "at most 1000 queries per step" in text
 
 
+def test_sets_that_all_attacks_have_stand_once_below_the_table_and_others_beside_their_attack() -> None:
+    usual = "linf+presence.hidden=9+latency.frames=4+held.share=0.5+actuator.delay=4"
+    threats = {"steady": usual, "rude": f"{usual}+dynamics.braking=8+dynamics.lane_gain=-0.2"}
+    attacks = [
+        drive(attack="fault", attack_params={"mode": mode}, threat=(norm, 0.1)) for mode, norm in threats.items()
+    ]
+    text = overview(pa.concat_tables([drive(), *attacks, baseline_drivers()]), 80)
+    assert text.count("presence.hidden=9") == 1
+    assert text.count(" braking=8") == text.count(" lane_gain=-0.2") == 1
+    assert re.search(r"mode=steady\s+0\.", text)
+    said = "threat: linf 0.1, presence.hidden=9, latency.frames=4, held.share=0.5, actuator.delay=4, access scores,"
+    assert said in " ".join(text.split())
+
+
+def test_the_threat_model_names_each_set_once() -> None:
+    (pair,) = read(one_pair(threat=("linf+presence.hidden=9", 0.2)))
+    assert threat(pair).startswith("linf 0.2: each")
+    assert threat(pair).count("presence.hidden=9") == 1
+
+
 def test_a_linf_threat_model_is_stated_on_the_normalised_scale() -> None:
     (pair,) = read(one_pair(threat=("linf", 0.2)))
     assert threat(pair).startswith("linf 0.2: each measured value may be off by 0.2 on the [-1, 1] scale")
