@@ -50,13 +50,11 @@ def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
 @inner
 def place_near(road: Road, body: Body, number: int) -> tuple[bool, float]:
     """`place_on` a lane or those linked to it."""
-    found, along = place_on(road, body, number)
-    link = 1
-    while not found and link < road.lanes[number].linked:
+    for link in range(road.lanes[number].linked):
         found, along = place_on(road, body, road.linked[number, link])
-        along += road.offsets[number, link]
-        link += 1
-    return found, along
+        if found:
+            return True, along + road.offsets[number, link]
+    return False, 0.0
 
 
 @inner
