@@ -48,6 +48,11 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `inner`, but compiled into each caller anew: what one of them does with the result, or leaves unused, is optimised there."""
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)(function)
+
+
 def rounded_once(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `inner`; a product and the sum that it is added to are rounded once, where the processor can. Sums keep their order."""
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, fastmath={"contract"})(function)

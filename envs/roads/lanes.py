@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from cavbench.compiled import inner
+from cavbench.compiled import inlined, inner
 from cavbench.envs.roads.network import NEAR, LaneKind, LaneRecord
 from cavbench.envs.roads.state import Body, Road
 
@@ -94,7 +94,7 @@ def distance_to(lane: LaneRecord, x: float, y: float) -> float:
     return abs(across) + max(along - lane.length, 0.0) + max(0.0 - along, 0.0)
 
 
-@inner
+@inlined
 def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least: float) -> tuple[float, float, float]:
     """AbstractLane.distance_with_heading: distance in m plus angle in rad, then the local coordinates.
 
