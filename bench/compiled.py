@@ -13,6 +13,8 @@ from typing import Any
 
 from numba import njit
 from numba.core.caching import FunctionCache
+from numba.extending import intrinsic
+from numba.np.arrayobj import make_array
 
 
 @cache
@@ -46,9 +48,29 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `inner`, but compiled into each caller anew: what one of them does with the result, or leaves unused, is optimised there."""
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)(function)
+
+
 def rounded_once(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `inner`; a product and the sum that it is added to are rounded once, where the processor can. Sums keep their order."""
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, fastmath={"contract"})(function)
+
+
+@intrinsic
+def uncounted(context: Any, array: Any) -> Any:
+    """In compiled code: a view of an array that is not reference-counted, because each call that passes an array on counts twice.
+
+    The caller keeps the array alive.
+    """
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        view = make_array(signature.return_type)(context, builder, arguments[0])
+        view.meminfo = view.meminfo.type(None)
+        return view._getvalue()
+
+    return array(array), build
 
 
 def entry_point(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.compiled import entry_point, inner
+from cavbench.compiled import entry_point, inner, uncounted
 from cavbench.envs.highway.ego import FASTER, IDLE, SLOWER
 from cavbench.envs.highway.engine import PROGRESS, REWARD, Flag, Number, X, check_seeds, physical_controls
 from cavbench.envs.highway.engine import report as copy_record
@@ -271,7 +271,7 @@ def step_batch(
     rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
     grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
     for number in range(episodes.size):
-        episode, cars = episodes[number], bodies[number]
+        episode, cars = episodes[number], uncounted(bodies[number])
         if paused[number] or episode.terminated or episode.truncated:
             numbers[REWARD, number] = 0.0
             numbers[PROGRESS, number] = 0.0
@@ -305,7 +305,7 @@ def start_batch(
     grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
     for row in range(chosen.size):
         number = chosen[row]
-        episode, cars = episodes[number], bodies[number]
+        episode, cars = episodes[number], uncounted(bodies[number])
         road = roads[episode.network]
         episode.seed, episode.steps, episode.frames, episode.time = seeds[row], 0, 0, 0.0
         episode.reward = episode.progress = 0.0
@@ -331,7 +331,7 @@ def look_batch(
     given = parameters[0]
     grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
     for number in range(episodes.size):
-        episode, cars = episodes[number], bodies[number]
+        episode, cars = episodes[number], uncounted(bodies[number])
         look(roads[episode.network], cars, episode, given, rows, work, grid, observation[number])
         report(roads[episode.network], cars, episode, given, numbers, flags, number)
 

@@ -6,8 +6,8 @@ import math
 
 import numpy as np
 
-from cavbench.compiled import inner
-from cavbench.envs.roads.network import LaneKind, LaneRecord
+from cavbench.compiled import inlined, inner
+from cavbench.envs.roads.network import NEAR, LaneKind, LaneRecord
 from cavbench.envs.roads.state import Body, Road
 
 STRAIGHT, SINE, CIRCULAR = int(LaneKind.STRAIGHT), int(LaneKind.SINE), int(LaneKind.CIRCULAR)
@@ -94,7 +94,7 @@ def distance_to(lane: LaneRecord, x: float, y: float) -> float:
     return abs(across) + max(along - lane.length, 0.0) + max(0.0 - along, 0.0)
 
 
-@inner
+@inlined
 def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least: float) -> tuple[float, float, float]:
     """AbstractLane.distance_with_heading: distance in m plus angle in rad, then the local coordinates.
 
@@ -125,12 +125,15 @@ def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least
 def update_lane(body: Body, road: Road) -> None:
     """RoadNetwork.get_closest_lane_index: set the lane of a body and its place on it; the first lane wins a tie.
 
-    The lane of the frame before is tried first, because most others are then ruled out at once.
+    The lane of the frame before is tried first. While the body is close to it, only the lanes near that one may be closer.
     """
-    best = body.lane
-    least, along, across = heading_distance(road.lanes[best], body.x, body.y, body.heading, np.inf)
-    before = best
-    for number in range(road.lane_count):
+    best = before = body.lane
+    least, along, across = heading_distance(road.lanes[before], body.x, body.y, body.heading, np.inf)
+    close = least <= NEAR
+    for place in range(road.lane_count):
+        number = np.int64(road.near[before, place]) if close else place
+        if number < 0:
+            break
         if number != before:
             apart, s, r = heading_distance(road.lanes[number], body.x, body.y, body.heading, least)
             if apart < least or (apart == least and number < best):

@@ -22,6 +22,8 @@ WIDTH = 4.0
 """AbstractLane.DEFAULT_WIDTH in m."""
 MARGIN = 1.0
 """Road.neighbour_vehicles: up to so many m beside a lane, cars are neighbours on it."""
+NEAR = 1.5
+"""While a body's distance from its lane in m plus its angle in rad is at most this, only a few lanes may be closer (`near`)."""
 
 
 class LaneKind(IntEnum):
@@ -159,6 +161,7 @@ ROAD = np.dtype(
         ("spots", np.int64, (MOST_SPOTS,)),  # lanes that the task names
         ("lanes", LANE, (MOST_LANES,)),
         ("edges", EDGE, (MOST_EDGES,)),  # roads, in highway-env's order
+        ("near", np.int8, (MOST_LANES, MOST_LANES)),  # for each lane the others that may be closer, -1 after the last
         ("linked", np.int64, (MOST_LANES, MOST_LINKED)),  # lanes that are searched for neighbours
         ("offsets", np.float64, (MOST_LANES, MOST_LINKED)),  # m, where they begin on the lane
         ("routes", np.int16, (MOST_ROUTES, LONGEST_ROUTE)),  # roads from a lane to a destination, -1 after the end
@@ -326,7 +329,7 @@ def record(
     table = np.zeros(1, dtype=ROAD)
     road = table[0]
     road["lane_count"], road["edge_count"], road["end"] = lanes, len(roads), end
-    road["factor"], road["reach"] = factor, _reach(roads)
+    road["factor"], road["reach"], road["near"] = factor, _reach(roads), near(network.lanes())
     road["spots"][: len(spots)] = spots
     road["routes"] = road["route_lanes"] = -1
     if way is not None:
@@ -348,6 +351,48 @@ def record(
                 road["route_lanes"][row, : len(route)] = [wanted for _, wanted in route]
             number += 1
     return table
+
+
+def near(lanes: Sequence[Lane], spacing: float = 0.5) -> NDArray[np.int8]:
+    """[MOST_LANES, MOST_LANES] for each lane the numbers of those that may be closer to a body within `NEAR` of it, then -1.
+
+    A lane is left out if it is surely farther than `NEAR` from every such place; points on the lane are checked every `spacing` m.
+    """
+    table = np.full((MOST_LANES, MOST_LANES), -1, dtype=np.int8)
+    for number, lane in enumerate(lanes):
+        points = _points(lane, np.linspace(0.0, lane.length, 2 + int(lane.length / spacing)))
+        reach = NEAR + abs(lane.amplitude) + spacing / 2 + NEAR
+        found = [
+            other
+            for other, beside in enumerate(lanes)
+            if other != number and _distance(beside, points).min() - abs(beside.amplitude) <= reach
+        ]
+        table[number, : len(found)] = found
+    return table
+
+
+def _points(lane: Lane, along: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N, 2] points on a lane; on a sine lane those on the line that it swings around."""
+    if lane.kind == LaneKind.CIRCULAR:
+        angle = lane.turn * along / lane.radius + lane.start_phase
+        return lane.center + lane.radius * np.stack([np.cos(angle), np.sin(angle)], 1)
+    return lane.start + along[:, None] * lane.direction
+
+
+def _distance(lane: Lane, points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """[N] Euclidean distances in m of points [N, 2] from a lane, of a sine lane those from the line that it swings around.
+
+    highway-env's distance from a lane adds what is beside it and what is beyond its end, so it is never smaller.
+    """
+    if lane.kind == LaneKind.CIRCULAR:
+        x, y = (points - lane.center).T
+        along = lane.turn * (np.arctan2(y, x) - lane.start_phase) % (2 * np.pi) * lane.radius
+        ends = _points(lane, np.array([0.0, lane.length]))
+        to_ends = np.linalg.norm(points[:, None] - ends, axis=2).min(1)
+        return np.where(along <= lane.length, abs(np.hypot(x, y) - lane.radius), to_ends)
+    x, y = (points - lane.start).T
+    along, across = x * lane.direction[0] + y * lane.direction[1], y * lane.direction[0] - x * lane.direction[1]
+    return np.hypot(across, np.maximum(np.maximum(-along, along - lane.length), 0.0))
 
 
 def _reach(roads: Sequence[tuple[str, str, list[Lane]]]) -> NDArray[np.int8]:

@@ -176,6 +176,7 @@ class Road(Protocol):
     spots: Integers
     lanes: Lanes
     edges: Edges
+    near: NDArray[np.int8]
     linked: Integers
     offsets: Floats
     routes: Integers

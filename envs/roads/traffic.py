@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from cavbench.compiled import inner
+from cavbench.compiled import inlined, inner
 from cavbench.envs.highway.dynamics import MAX_STEERING, clip, not_zero
 from cavbench.envs.highway.search import NO_ONE
 from cavbench.envs.highway.traffic import (
@@ -34,7 +34,7 @@ def is_aside(lane: LaneRecord, x: float, y: float) -> bool:
     return abs(across) - abs(lane.amplitude) > lane.width / 2 + lane.margin + 1e-6
 
 
-@inner
+@inlined
 def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
     """Whether a body is on a lane or within its margin, and where, in m."""
     lane = road.lanes[number]
@@ -47,19 +47,17 @@ def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
     return is_on(lane, along, across, lane.margin), along
 
 
-@inner
+@inlined
 def place_near(road: Road, body: Body, number: int) -> tuple[bool, float]:
     """`place_on` a lane or those linked to it."""
-    found, along = place_on(road, body, number)
-    link = 1
-    while not found and link < road.lanes[number].linked:
+    for link in range(road.lanes[number].linked):
         found, along = place_on(road, body, road.linked[number, link])
-        along += road.offsets[number, link]
-        link += 1
-    return found, along
+        if found:
+            return True, along + road.offsets[number, link]
+    return False, 0.0
 
 
-@inner
+@inlined
 def neighbours_on_straight(lane: LaneRecord, bodies: Bodies, number: int) -> tuple[int, int]:
     """`neighbours` on a straight lane without linked ones: the same numbers without branches, which here cannot be predicted."""
     start_x, start_y, direction_x, direction_y = lane.start_x, lane.start_y, lane.direction_x, lane.direction_y
@@ -79,7 +77,7 @@ def neighbours_on_straight(lane: LaneRecord, bodies: Bodies, number: int) -> tup
     return front, rear
 
 
-@inner
+@inlined
 def neighbours(road: Road, bodies: Bodies, number: int, lane: int) -> tuple[int, int]:
     """Road.neighbour_vehicles: the bodies ahead of and behind a car on a lane, or NO_ONE.
 
