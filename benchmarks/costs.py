@@ -1,14 +1,15 @@
 """Measures what attacks on defended victims cost, and writes the table that `bench run` estimates with:
 
-    python benchmarks/costs.py                        # every row of ROWS and WORLDS: about 20 CPU minutes
+    python benchmarks/costs.py                        # every row of ROWS and WORLDS
     python benchmarks/costs.py dqn+shield yolov5      # these rows
     python benchmarks/costs.py merge highway-v0       # these worlds
 
 The table is `bench/run/costs.json` (`cavbench.run.cost`), in CPU seconds of one thread. Each attack drives a small and a large
-batch in one cell. What they took is a cost of each step of the longest episode and a cost of each step of every episode. `batch`
-is the first one for all steps that an episode can have, `episode` the second one for a mean episode. `length` is the mean length
-of an episode, as a share of all steps: that of the published records where they have the pair. What is prepared is measured with
-little effort.
+batch in one cell; of a pair with published records only the first `DECISIONS` of each episode. What they took is a cost of each
+step of the longest episode and a cost of each step of every episode. `batch` is the first one for all steps that an episode can
+have, `episode` the second one for a mean episode. `length` is the mean length of an episode, as a share of all steps: that of the
+published records where they have the pair. `alone` is 1 where the units of the pair cannot be driven together. What is prepared
+is measured with little effort.
 """
 
 from __future__ import annotations
@@ -17,15 +18,21 @@ import argparse
 import json
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from cavbench.core import registry
-from cavbench.core.pair import choose
+from cavbench.core.pair import Pair, choose
+from cavbench.driving import DrivingFacts
+from cavbench.driving.drive import drive_jointly
+from cavbench.driving.meter import Columns
+from cavbench.driving.rollout import rollout
 from cavbench.errors import UserError
 from cavbench.files import whole
 from cavbench.isolation.framework import Snapshot
@@ -48,9 +55,11 @@ ROWS = {
     "clairvoyant": ("none",),
     "planner": ("none", *FEW),
     **dict.fromkeys(("ddpg", "ppo", "sac"), ("none", *FEW)),
-    **{f"dqn+{name}": ("none", *FEW) for name in ("advtrain", "atla", "car", "sa", "smoothing", "tracker")},
-    **{f"dqn+{name}": ("none", *FEW) for name in ("frame_stack", "pessimist_q")},
-    **{f"dqn+{name}": ("none", "noise", "pgd") for name in ("shield", "tracker+shield")},
+    **{f"dqn+{name}": ("none", *FEW) for name in ("advtrain", "atla", "car", "sa", "tracker", "frame_stack")},
+    **{
+        f"dqn+{name}": ("none", *FEW, "plan", "rehearse", "pessimist")
+        for name in ("pessimist_q", "shield", "tracker+shield", "smoothing")
+    },
     **{name: (*PATCHES, "square_patch") if name == "yolov5" else PATCHES for name in ("yolov5", "yolov3_tiny")},
     **dict.fromkeys(("fcos", "rcnn"), PATCHES),
     **{f"yolov5+{name}": PATCHES for name in ("jpeg", "median", "temporal", "advtrain_detection")},
@@ -63,6 +72,8 @@ WORLDS = (
 DETECTORS = ("yolov5", "yolov3_tiny", "fcos", "rcnn")
 DRIVEN, DETECTED, SLOW, SLOW_S = (2, 40), (1, 3), 6, 8.0
 """Episodes of the two batches on each track; and of the second one if the first took longer than so many seconds."""
+DECISIONS = 60
+"""The first decisions of an episode cost as much as the others."""
 WORDS = {
     "eot": ("attack.steps=15",),
     "square_patch": ("attack.steps=20",),
@@ -82,20 +93,40 @@ def measured(words: Sequence[str], framework: Snapshot, cells: Sequence[str]) ->
         outcome, seconds = _timed(Task(unit=unit, step="prepare"), framework)
         found["artefact"], artefacts = seconds / times, {unit.artefact: outcome.artefact or b""}
         times = 1.0
-    sizes = DETECTED if unit.track.name == "detection" else DRIVEN
-    few, seconds = _timed(_task(unit, sizes[0], artefacts), framework)
-    many, more = _timed(_task(unit, sizes[1] if seconds < SLOW_S else SLOW, artefacts), framework)
-    steps = getattr(unit.pair.world.component, "max_steps", 1)
+    driving = unit.track.name == "driving"
+    sizes, steps = DETECTED if not driving else DRIVEN, getattr(unit.pair.world.component, "max_steps", 1)
+    length = _published(unit.pair) if driving else None
+    with _cut_short(DECISIONS if length else steps):
+        _timed(_task(unit, 1, artefacts), framework)
+        few, seconds = _timed(_task(unit, sizes[0], artefacts), framework)
+        many, more = _timed(_task(unit, sizes[1] if seconds < SLOW_S else SLOW, artefacts), framework)
     per_step, per_row = _costs([few, many], [seconds, more])
-    found |= {"batch": per_step * steps / times, "episode": per_row * float(_steps(many).mean()) / times}
-    if unit.track.name == "driving":
-        name = (
-            unit.pair.victim.name
-            if unit.pair.defense.name == "none"
-            else f"{unit.pair.victim.name}+{unit.pair.defense.name}"
-        )
-        found["length"] = lengths().get((name, unit.pair.attack.name), float(_steps(many).mean())) / steps
+    length = length or float(_steps(many).mean())
+    found |= {"batch": per_step * steps / times, "episode": per_row * length / times}
+    if driving:
+        found["length"] = length / steps
+        with _cut_short(1):
+            jobs = [replace(unit.job, attack_seed=seed, seeds=unit.seeds[:1]) for seed in range(2)]
+            if drive_jointly(jobs) is None:
+                found["alone"] = 1.0
     return {name: float(f"{value:.3g}") for name, value in found.items()}
+
+
+def _cut_short(decisions: int) -> AbstractContextManager[object]:
+    """Episodes end after so many decisions, which no user of the benchmark may choose."""
+
+    def short(*given: Any, facts: DrivingFacts, **more: Any) -> Columns:
+        return rollout(*given, facts=replace(facts, max_steps=min(decisions, facts.max_steps)), **more)
+
+    return patch("cavbench.driving.drive.rollout", short)
+
+
+def _published(pair: Pair) -> float | None:
+    """The mean steps of an episode of a pair in the published records; None if they do not have it."""
+    victim, defense = pair.victim.name, pair.defense.name
+    if pair.world.name != "highway":
+        return None
+    return lengths().get((victim if defense == "none" else f"{victim}+{defense}", pair.attack.name))
 
 
 @cache
