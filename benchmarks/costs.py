@@ -2,6 +2,7 @@
 
     python benchmarks/costs.py                        # every row of ROWS and WORLDS
     python benchmarks/costs.py dqn+shield yolov5      # these rows
+    python benchmarks/costs.py dqn --attacks pgd zo   # these attacks of a row; what is known of the others stays
     python benchmarks/costs.py merge highway-v0       # these worlds
 
 The table is `bench/run/costs.json` (`cavbench.run.cost`), in CPU seconds of one thread. Each attack drives a small and a large
@@ -30,7 +31,7 @@ import numpy as np
 from cavbench.core import registry
 from cavbench.core.pair import Pair, choose
 from cavbench.driving import DrivingFacts
-from cavbench.driving.drive import drive_jointly
+from cavbench.driving.drive import drive, drive_jointly
 from cavbench.driving.meter import Columns
 from cavbench.driving.rollout import rollout
 from cavbench.errors import UserError
@@ -72,7 +73,7 @@ WORLDS = (
 DETECTORS = ("yolov5", "yolov3_tiny", "fcos", "rcnn")
 DRIVEN, DETECTED, SLOW, SLOW_S = (2, 40), (1, 3), 6, 8.0
 """Episodes of the two batches on each track; and of the second one if the first took longer than so many seconds."""
-DECISIONS = 60
+DECISIONS = 30
 """The first decisions of an episode cost as much as the others."""
 WORDS = {
     "eot": ("attack.steps=15",),
@@ -96,12 +97,13 @@ def measured(words: Sequence[str], framework: Snapshot, cells: Sequence[str]) ->
     driving = unit.track.name == "driving"
     sizes, steps = DETECTED if not driving else DRIVEN, getattr(unit.pair.world.component, "max_steps", 1)
     length = _published(unit.pair) if driving else None
-    with _cut_short(DECISIONS if length else steps):
-        _timed(_task(unit, 1, artefacts), framework)
-        few, seconds = _timed(_task(unit, sizes[0], artefacts), framework)
-        many, more = _timed(_task(unit, sizes[1] if seconds < SLOW_S else SLOW, artefacts), framework)
+    # Whatever is compiled or loaded once is not measured.
+    _batch(unit, 1, artefacts, framework, cut=length is not None)
+    few, seconds = _batch(unit, sizes[0], artefacts, framework, cut=length is not None)
+    larger = sizes[1] if seconds < SLOW_S else SLOW
+    many, more = _batch(unit, larger, artefacts, framework, cut=length is not None)
     per_step, per_row = _costs([few, many], [seconds, more])
-    length = length or float(_steps(many).mean())
+    length = length or float(many.mean())
     found |= {"batch": per_step * steps / times, "episode": per_row * length / times}
     if driving:
         found["length"] = length / steps
@@ -152,9 +154,18 @@ def _is_default(attack: str, params: str) -> bool:
     return all(given.get(name, value) == value for name, value in own.items())
 
 
-def _task(unit: Unit, episodes: int, artefacts: Mapping[str, bytes]) -> Task:
-    """A batch of some of the episodes of a unit."""
-    return Task(unit=replace(unit, seeds=unit.seeds[:episodes]), artefacts=artefacts)
+def _batch(
+    unit: Unit, episodes: int, artefacts: Mapping[str, bytes], framework: Snapshot, *, cut: bool
+) -> tuple[Any, float]:
+    """The steps of some of the episodes of a unit, which are driven in a batch, and the seconds that this takes."""
+    part = replace(unit, seeds=unit.seeds[:episodes])
+    if not cut:
+        outcome, seconds = _timed(Task(unit=part, artefacts=artefacts), framework)
+        return _steps(outcome), seconds
+    start = time.process_time()
+    with _cut_short(DECISIONS):
+        steps = drive(part.job, ()).columns["steps"]
+    return steps, time.process_time() - start
 
 
 def _timed(task: Task, framework: Snapshot) -> tuple[Outcome, float]:
@@ -165,10 +176,9 @@ def _timed(task: Task, framework: Snapshot) -> tuple[Outcome, float]:
     return outcome, time.process_time() - start
 
 
-def _costs(outcomes: Sequence[Outcome], seconds: Sequence[float]) -> tuple[float, float]:
-    """The seconds of a step of a batch, and of a step of an episode, from what batches of different sizes took."""
-    driven = [_steps(outcome) for outcome in outcomes]
-    longest, total = np.array([one.max() for one in driven]), np.array([one.sum() for one in driven])
+def _costs(steps: Sequence[Any], seconds: Sequence[float]) -> tuple[float, float]:
+    """The seconds of a step of a batch, and of a step of an episode, from what batches with so many steps took."""
+    longest, total = np.array([one.max() for one in steps]), np.array([one.sum() for one in steps])
     per_step, per_row = np.linalg.solve(np.stack([longest, total], 1), np.array(seconds))
     if per_row < 0 or per_step < 0:
         per_row = max(per_row, 0.0) and seconds[-1] / total[-1]
@@ -177,19 +187,20 @@ def _costs(outcomes: Sequence[Outcome], seconds: Sequence[float]) -> tuple[float
 
 
 def _steps(outcome: Outcome) -> Any:
+    """The steps of the episodes of a batch; 1 for each of an image."""
     assert outcome.records is not None
     if "steps" not in outcome.records.column_names:
         return np.ones(outcome.records.num_rows)
     return outcome.records["steps"].to_numpy()
 
 
-def row_of(name: str, framework: Snapshot) -> dict[str, dict[str, float]]:
-    """The costs of every attack of a row."""
+def row_of(name: str, attacks: Sequence[str], framework: Snapshot) -> dict[str, dict[str, float]]:
+    """The costs of attacks on a row."""
     victim, _, defense = name.partition("+")
     cells = ("lanes=3",) if victim in DETECTORS else ("lanes=4", "density=1", "weather=clear")
     words = (f"victim={victim}", f"defense={defense or 'none'}")
     found: dict[str, dict[str, float]] = {}
-    for attack in ROWS[name]:
+    for attack in attacks:
         start = time.process_time()
         try:
             found[attack] = measured((*words, f"attack={attack}", *WORDS.get(attack, ())), framework, cells)
@@ -212,7 +223,7 @@ def world_of(name: str, framework: Snapshot) -> dict[str, float]:
         except UserError as error:
             print(f"{name} {attack}: {error}", flush=True)
             break
-        steps = _steps(_timed(_task(unit, DRIVEN[0] * 3, {}), framework)[0])
+        steps, _ = _batch(unit, DRIVEN[0] * 3, {}, framework, cut=False)
         found[column] = float(f"{steps.mean() / unit.pair.world.component.max_steps:.3g}")
     print(name, found, flush=True)
     return found
@@ -222,7 +233,9 @@ def main() -> None:
     """The command of this module."""
     parser = argparse.ArgumentParser(description="Measure the costs that bench run estimates with.")
     parser.add_argument("names", nargs="*", help="rows or worlds; without any, all")
-    names = parser.parse_args().names or [*ROWS, *WORLDS]
+    parser.add_argument("--attacks", nargs="+", help="of the rows, whose others stay; without any, all")
+    given = parser.parse_args()
+    names = given.names or [*ROWS, *WORLDS]
     if unknown := [name for name in names if name not in (*ROWS, *WORLDS)]:
         parser.error(f"no row or world is called {', '.join(unknown)}; there are {', '.join((*ROWS, *WORLDS))}")
     settle()
@@ -230,13 +243,14 @@ def main() -> None:
     framework = Snapshot()
     for name in names:
         if name in WORLDS:
-            track, place, found = "driving", "worlds", {name: world_of(name, framework)}
+            track, place, found = "driving", "worlds", world_of(name, framework)
         else:
             track = "detection" if name.partition("+")[0] in DETECTORS else "driving"
-            place, found = "rows", {name: row_of(name, framework)}
+            place, found = "rows", row_of(name, given.attacks or ROWS[name], framework)
         # Read again: another process may measure other rows.
         table = json.loads(TABLE.read_text())
-        table[track].setdefault(place, {}).update(found)
+        known = table[track].setdefault(place, {})
+        known[name] = {**known.get(name, {}), **found} if given.attacks else found
         with whole(TABLE) as file:
             file.write((json.dumps(table, indent=1, sort_keys=True) + "\n").encode())
 

@@ -1,4 +1,4 @@
-"""Points of what the true state may be, the box of every car, in one compiled call; torch computes whatever it is not made for."""
+"""Points of what the true state may be in one compiled call; torch computes whatever it is not made for."""
 
 from __future__ import annotations
 
