@@ -2,6 +2,7 @@
 
     python benchmarks/compiled_speed.py [--attacks pgd zo rehearse] [--defense advtrain] [--episodes 20] [--rounds 3]
     python benchmarks/compiled_speed.py --part filter --defense tracker+shield --attacks pgd rehearse
+    python benchmarks/compiled_speed.py --part belief --defense pessimist_q --attacks pgd
 
 Prints the CPU time of a pass of the victim, forward and with its gradient, and of whole units, each as torch's over that of the
 compiled code. Both are measured alternately in one process and one thread, on scenarios that tune attacks; the median of the
@@ -25,6 +26,7 @@ from cavbench.core.track import Job
 from cavbench.driving import Policy, State
 from cavbench.driving.drive import drive
 from cavbench.driving.fused.network import Fused
+from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.policy import repeated
 from cavbench.envs.highway.axes import AXES
@@ -33,7 +35,7 @@ from cavbench.errors import in_one_line
 from cavbench.run.process import settle
 from cavbench.scenarios import SeedBlock
 
-PARTS = {"network": Fused, "filter": Mask}
+PARTS = {"network": Fused, "filter": Mask, "belief": Belief}
 SIZES = (20, 40, 160, 720, 1600)
 
 

@@ -1,14 +1,16 @@
 """Measures what attacks on defended victims cost, and writes the table that `bench run` estimates with:
 
-    python benchmarks/costs.py                        # every row of ROWS and WORLDS: about 20 CPU minutes
+    python benchmarks/costs.py                        # every row of ROWS and WORLDS
     python benchmarks/costs.py dqn+shield yolov5      # these rows
+    python benchmarks/costs.py dqn --attacks pgd zo   # these attacks of a row; what is known of the others stays
     python benchmarks/costs.py merge highway-v0       # these worlds
 
 The table is `bench/run/costs.json` (`cavbench.run.cost`), in CPU seconds of one thread. Each attack drives a small and a large
-batch in one cell. What they took is a cost of each step of the longest episode and a cost of each step of every episode. `batch`
-is the first one for all steps that an episode can have, `episode` the second one for a mean episode. `length` is the mean length
-of an episode, as a share of all steps: that of the published records where they have the pair. What is prepared is measured with
-little effort.
+batch in one cell; of a pair with published records only the first `DECISIONS` of each episode. What they took is a cost of each
+step of the longest episode and a cost of each step of every episode. `batch` is the first one for all steps that an episode can
+have, `episode` the second one for a mean episode. `length` is the mean length of an episode, as a share of all steps: that of the
+published records where they have the pair. `alone` is 1 where the units of the pair cannot be driven together. What is prepared
+is measured with little effort.
 """
 
 from __future__ import annotations
@@ -19,15 +21,21 @@ import json
 import resource
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 
 from cavbench.core import registry
-from cavbench.core.pair import choose
+from cavbench.core.pair import Pair, choose
+from cavbench.driving import DrivingFacts
+from cavbench.driving.drive import drive, drive_jointly
+from cavbench.driving.meter import Columns
+from cavbench.driving.rollout import rollout
 from cavbench.errors import UserError
 from cavbench.files import whole
 from cavbench.isolation.framework import Snapshot
@@ -50,9 +58,11 @@ ROWS = {
     "clairvoyant": ("none",),
     "planner": ("none", *FEW),
     **dict.fromkeys(("ddpg", "ppo", "sac"), ("none", *FEW)),
-    **{f"dqn+{name}": ("none", *FEW) for name in ("advtrain", "atla", "car", "sa", "smoothing", "tracker")},
-    **{f"dqn+{name}": ("none", *FEW) for name in ("frame_stack", "pessimist_q")},
-    **{f"dqn+{name}": ("none", "noise", "pgd") for name in ("shield", "tracker+shield")},
+    **{f"dqn+{name}": ("none", *FEW) for name in ("advtrain", "atla", "car", "sa", "tracker", "frame_stack")},
+    **{
+        f"dqn+{name}": ("none", *FEW, "plan", "rehearse", "pessimist")
+        for name in ("pessimist_q", "shield", "tracker+shield", "smoothing")
+    },
     **{name: (*PATCHES, "square_patch") if name == "yolov5" else PATCHES for name in ("yolov5", "yolov3_tiny")},
     **dict.fromkeys(("fcos", "rcnn"), PATCHES),
     **{f"yolov5+{name}": PATCHES for name in ("jpeg", "median", "temporal", "advtrain_detection")},
@@ -66,6 +76,8 @@ WORLDS = (
 DETECTORS = ("yolov5", "yolov3_tiny", "fcos", "rcnn")
 DRIVEN, DETECTED, SLOW, SLOW_S = (2, 40), (1, 3), 6, 8.0
 """Episodes of the two batches on each track; and of the second one if the first took longer than so many seconds."""
+DECISIONS = 30
+"""The first decisions of an episode cost as much as the others."""
 WORDS = {
     "eot": ("attack.steps=15",),
     "square_patch": ("attack.steps=20",),
@@ -85,22 +97,41 @@ def measured(words: Sequence[str], framework: Snapshot, cells: Sequence[str]) ->
         outcome, seconds = _timed(Task(unit=unit, step="prepare"), framework)
         found["artefact"], artefacts = seconds / times, {unit.artefact: outcome.artefact or b""}
         times = 1.0
-    sizes = DETECTED if unit.track.name == "detection" else DRIVEN
+    driving = unit.track.name == "driving"
+    sizes, steps = DETECTED if not driving else DRIVEN, getattr(unit.pair.world.component, "max_steps", 1)
+    length = _published(unit.pair) if driving else None
     # What is made once, such as kernels and a road for SUMO, is no cost of a batch.
-    _timed(_task(unit, 1, artefacts), framework)
-    few, seconds = _timed(_task(unit, sizes[0], artefacts), framework)
-    many, more = _timed(_task(unit, sizes[1] if seconds < SLOW_S else SLOW, artefacts), framework)
-    steps = getattr(unit.pair.world.component, "max_steps", 1)
+    _batch(unit, 1, artefacts, framework, cut=length is not None)
+    few, seconds = _batch(unit, sizes[0], artefacts, framework, cut=length is not None)
+    larger = sizes[1] if seconds < SLOW_S else SLOW
+    many, more = _batch(unit, larger, artefacts, framework, cut=length is not None)
     per_step, per_row = _costs([few, many], [seconds, more])
-    found |= {"batch": per_step * steps / times, "episode": per_row * float(_steps(many).mean()) / times}
-    if unit.track.name == "driving":
-        name = (
-            unit.pair.victim.name
-            if unit.pair.defense.name == "none"
-            else f"{unit.pair.victim.name}+{unit.pair.defense.name}"
-        )
-        found["length"] = lengths().get((name, unit.pair.attack.name), float(_steps(many).mean())) / steps
+    length = length or float(many.mean())
+    found |= {"batch": per_step * steps / times, "episode": per_row * length / times}
+    if driving:
+        found["length"] = length / steps
+        with _cut_short(1):
+            jobs = [replace(unit.job, attack_seed=seed, seeds=unit.seeds[:1]) for seed in range(2)]
+            if drive_jointly(jobs) is None:
+                found["alone"] = 1.0
     return {name: float(f"{value:.3g}") for name, value in found.items()}
+
+
+def _cut_short(decisions: int) -> AbstractContextManager[object]:
+    """Episodes end after so many decisions, which no user of the benchmark may choose."""
+
+    def short(*given: Any, facts: DrivingFacts, **more: Any) -> Columns:
+        return rollout(*given, facts=replace(facts, max_steps=min(decisions, facts.max_steps)), **more)
+
+    return patch("cavbench.driving.drive.rollout", short)
+
+
+def _published(pair: Pair) -> float | None:
+    """The mean steps of an episode of a pair in the published records; None if they do not have it."""
+    victim, defense = pair.victim.name, pair.defense.name
+    if pair.world.name != "highway":
+        return None
+    return lengths().get((victim if defense == "none" else f"{victim}+{defense}", pair.attack.name))
 
 
 @cache
@@ -126,9 +157,18 @@ def _is_default(attack: str, params: str) -> bool:
     return all(given.get(name, value) == value for name, value in own.items())
 
 
-def _task(unit: Unit, episodes: int, artefacts: Mapping[str, bytes]) -> Task:
-    """A batch of some of the episodes of a unit."""
-    return Task(unit=replace(unit, seeds=unit.seeds[:episodes]), artefacts=artefacts)
+def _batch(
+    unit: Unit, episodes: int, artefacts: Mapping[str, bytes], framework: Snapshot, *, cut: bool
+) -> tuple[Any, float]:
+    """The steps of some of the episodes of a unit, which are driven in a batch, and the seconds that this takes."""
+    part = replace(unit, seeds=unit.seeds[:episodes])
+    if not cut:
+        outcome, seconds = _timed(Task(unit=part, artefacts=artefacts), framework)
+        return _steps(outcome), seconds
+    start = time.process_time()
+    with _cut_short(DECISIONS):
+        steps = drive(part.job, ()).columns["steps"]
+    return steps, time.process_time() - start
 
 
 def _timed(task: Task, framework: Snapshot) -> tuple[Outcome, float]:
@@ -147,10 +187,9 @@ def cpu() -> float:
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
-def _costs(outcomes: Sequence[Outcome], seconds: Sequence[float]) -> tuple[float, float]:
-    """The seconds of a step of a batch, and of a step of an episode, from what batches of different sizes took."""
-    driven = [_steps(outcome) for outcome in outcomes]
-    longest, total = np.array([one.max() for one in driven]), np.array([one.sum() for one in driven])
+def _costs(steps: Sequence[Any], seconds: Sequence[float]) -> tuple[float, float]:
+    """The seconds of a step of a batch, and of a step of an episode, from what batches with so many steps took."""
+    longest, total = np.array([one.max() for one in steps]), np.array([one.sum() for one in steps])
     per_step, per_row = np.linalg.solve(np.stack([longest, total], 1), np.array(seconds))
     if per_row < 0 or per_step < 0:
         per_row = max(per_row, 0.0) and seconds[-1] / total[-1]
@@ -159,19 +198,20 @@ def _costs(outcomes: Sequence[Outcome], seconds: Sequence[float]) -> tuple[float
 
 
 def _steps(outcome: Outcome) -> Any:
+    """The steps of the episodes of a batch; 1 for each of an image."""
     assert outcome.records is not None
     if "steps" not in outcome.records.column_names:
         return np.ones(outcome.records.num_rows)
     return outcome.records["steps"].to_numpy()
 
 
-def row_of(name: str, framework: Snapshot) -> dict[str, dict[str, float]]:
-    """The costs of every attack of a row."""
+def row_of(name: str, attacks: Sequence[str], framework: Snapshot) -> dict[str, dict[str, float]]:
+    """The costs of attacks on a row."""
     victim, _, defense = name.partition("+")
     cells = ("lanes=3",) if victim in DETECTORS else ("lanes=4", "density=1", "weather=clear")
     words = (f"victim={victim}", f"defense={defense or 'none'}")
     found: dict[str, dict[str, float]] = {}
-    for attack in ROWS[name]:
+    for attack in attacks:
         start = time.process_time()
         try:
             found[attack] = measured((*words, f"attack={attack}", *WORDS.get(attack, ())), framework, cells)
@@ -194,7 +234,7 @@ def world_of(name: str, framework: Snapshot) -> dict[str, float]:
         except UserError as error:
             print(f"{name} {attack}: {error}", flush=True)
             break
-        steps = _steps(_timed(_task(unit, DRIVEN[0] * 3, {}), framework)[0])
+        steps, _ = _batch(unit, DRIVEN[0] * 3, {}, framework, cut=False)
         found[column] = float(f"{steps.mean() / unit.pair.world.component.max_steps:.3g}")
     print(name, found, flush=True)
     return found
@@ -204,7 +244,9 @@ def main() -> None:
     """The command of this module."""
     parser = argparse.ArgumentParser(description="Measure the costs that bench run estimates with.")
     parser.add_argument("names", nargs="*", help="rows or worlds; without any, all")
-    names = parser.parse_args().names or [*ROWS, *WORLDS]
+    parser.add_argument("--attacks", nargs="+", help="of the rows, whose others stay; without any, all")
+    given = parser.parse_args()
+    names = given.names or [*ROWS, *WORLDS]
     if unknown := [name for name in names if name not in (*ROWS, *WORLDS)]:
         parser.error(f"no row or world is called {', '.join(unknown)}; there are {', '.join((*ROWS, *WORLDS))}")
     settle()
@@ -212,13 +254,14 @@ def main() -> None:
     framework = Snapshot()
     for name in names:
         if name in WORLDS:
-            track, place, found = "driving", "worlds", {name: world_of(name, framework)}
+            track, place, found = "driving", "worlds", world_of(name, framework)
         else:
             track = "detection" if name.partition("+")[0] in DETECTORS else "driving"
-            place, found = "rows", {name: row_of(name, framework)}
+            place, found = "rows", row_of(name, given.attacks or ROWS[name], framework)
         # Read again: another process may measure other rows.
         table = json.loads(TABLE.read_text())
-        table[track].setdefault(place, {}).update(found)
+        known = table[track].setdefault(place, {})
+        known[name] = {**known.get(name, {}), **found} if given.attacks else found
         with whole(TABLE) as file:
             file.write((json.dumps(table, indent=1, sort_keys=True) + "\n").encode())
 

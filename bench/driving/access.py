@@ -23,7 +23,7 @@ from cavbench.driving.forgery import Forgery
 from cavbench.driving.forging import Forging
 from cavbench.driving.gradients import Gradients, Tangent
 from cavbench.driving.parts import Part, parts_of
-from cavbench.driving.policy import State, repeated, rows_of
+from cavbench.driving.policy import State, rows_of
 from cavbench.driving.threat import ObservationThreat, PerturbationSet, bounds, within
 from cavbench.driving.traffic import ORDERED, Orders, View
 from cavbench.driving.victim import CountedPolicy
@@ -206,7 +206,7 @@ class Oracle:
         It belongs to the victim. None if the victim has no state.
         """
         permit("dynamics", self._enforcer.access)
-        return repeated(self._enforcer.remembered(self._rows), torch.Size([copies]))
+        return self._enforcer.remembered(self._rows, copies)
 
     def rehearse(self, observation: Tensor, state: State) -> tuple[Tensor, State]:
         """What the victim does in simulated episodes, and its state after that; needs access `dynamics`.
@@ -239,7 +239,7 @@ class Oracle:
     def _paid(self, access: Access, points: Tensor) -> State:
         """Count the queries [..., B, V, F]; the victim's state for each of them, flattened to [N]."""
         self._enforcer.spend(access, self._step, points, self._rows)
-        return repeated(self._enforcer.remembered(self._rows), points.shape[:-3])
+        return self._enforcer.remembered(self._rows, points.shape[:-3].numel())
 
     def _repeated(self, points: Tensor) -> Tensor:
         """`draws` copies of the points, [D, ...]; the points themselves if one is enough."""
@@ -378,11 +378,17 @@ class Enforcer:
             )
         self.spent = torch.from_numpy(wanted)
 
-    def remembered(self, rows: Tensor | None) -> State:
-        """The victim's state of this step, of all episodes or of `rows`: a copy, for a policy that writes to it in a query."""
-        if rows is None:
-            return None if self._state is None else self._state.clone()
-        return rows_of(self._state, rows)
+    def remembered(self, rows: Tensor | None, copies: int) -> State:
+        """The victim's state of this step, of all episodes or of `rows`, K `copies` one after the other, [K * R].
+
+        It belongs to the query: a policy may write to it.
+        """
+        if self._state is None:
+            return None
+        if copies == 1:
+            return self._state.clone() if rows is None else rows_of(self._state, rows)
+        places = torch.arange(len(self._state)) if rows is None else rows
+        return rows_of(self._state, places.repeat(copies))
 
     def project(self, answer: Tensor | Forgery, name: str = "the attack") -> tuple[Tensor, Tensor]:
         """The answer in the sets of the threat model, and how far it was from them (`PerturbationSet.project`, `Forging.show`).

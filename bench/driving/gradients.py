@@ -36,22 +36,25 @@ class Gradients:
             observed: whether it is a gradient in the observation. A NaN in a fixed entry is then not counted: it costs the
                 attack nothing.
         """
-        places = torch.arange(self.counts.shape[1]) if rows is None else rows
         if not finite(gradient):
             lost = ~gradient.isfinite()
             gradient = gradient.masked_fill(lost, 0.0)
             if observed:
-                lost = lost & torch.from_numpy(self._radius > 0).flatten(1)[places]
-            self._add(2, lost.any(-1), places)
-        zero = (gradient == 0).all(-1)
-        self._add(0, torch.ones_like(zero), places)
-        self._add(1, zero, places)
+                free = torch.from_numpy(self._radius > 0).flatten(1)
+                lost = lost & (free if rows is None else free[rows])
+            self._add(2, lost.any(-1), rows)
+        zero = ~gradient.any(-1)
+        self._add(0, torch.ones_like(zero), rows)
+        self._add(1, zero, rows)
         return gradient
 
-    def _add(self, which: int, marks: Tensor, places: Tensor) -> None:
-        """Add the marks [..., B] to the counter of their episodes."""
-        added = marks.long().flatten(0, -2).sum(0) if marks.ndim > 1 else marks.long()
-        self.counts[which].index_add_(0, places, added)
+    def _add(self, which: int, marks: Tensor, rows: Tensor | None) -> None:
+        """Add the marks [..., B] to the counter of all episodes, or of `rows`."""
+        added = marks.sum(tuple(range(marks.ndim - 1))) if marks.ndim > 1 else marks.long()
+        if rows is None:
+            self.counts[which] += added
+        else:
+            self.counts[which].index_add_(0, rows, added)
 
 
 class Tangent(torch.autograd.Function):

@@ -128,6 +128,7 @@ class Rates:
         episode: of each episode in it.
         unknown: its components whose cost nobody measured.
         length: mean length of an episode, as a share of all steps.
+        alone: whether each unit is a batch of its own, because the victim is random.
     """
 
     artefact: float
@@ -135,6 +136,7 @@ class Rates:
     episode: float
     unknown: tuple[str, ...] = ()
     length: float = 1.0
+    alone: bool = False
 
     def of(self, episodes: int) -> float:
         """A batch of so many episodes."""
@@ -194,7 +196,8 @@ def rates(pair: Pair) -> Rates:
     batch = here["batch"] + max(batch - usual["batch"], 0.0) * times
     episode = here["episode"] + max(episode - usual["episode"], 0.0) * times
     length = _of_row(rows, own, attack, "length") or 1.0
-    return Rates(0.0, batch, episode, tuple(unknown), _there(length, usual, here))
+    alone = any(costs.get("alone") for costs in rows.get(own, {}).values())
+    return Rates(0.0, batch, episode, tuple(unknown), _there(length, usual, here), alone)
 
 
 def _there(length: float, usual: Mapping[str, float], here: Mapping[str, float]) -> float:
@@ -265,7 +268,8 @@ def shares(units: Sequence[Unit], workers: int, recorded: Collection[str] = ()) 
         own = known.setdefault(batch[0].pair.id, rates(batch[0].pair))
         episodes = sum(len(task.unit.seeds) for task in batch)
         for task in batch:
-            found[id(task.unit)] = own.of(episodes) * len(task.unit.seeds) / episodes
+            size = len(task.unit.seeds)
+            found[id(task.unit)] = own.of(size) if own.alone else own.of(episodes) * size / episodes
     return [found[id(unit)] for unit in units]
 
 

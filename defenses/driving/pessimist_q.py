@@ -12,9 +12,10 @@ from torch import Tensor
 
 from cavbench.core.ranges import Count, Share
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
+from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego
-from cavbench.driving.intervals.policy import IntervalPolicy, corrected, with_inner
+from cavbench.driving.intervals.policy import IntervalPolicy, corrected, remembers, with_inner
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
 
@@ -57,6 +58,7 @@ class Believing(IntervalPolicy):
         super().__init__(facts, policy.action_type, settings.assumed_norm, settings.assumed_budget)
         self.policy, self.settings = policy, settings
         self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
+        self.compiled = Belief(self.reckoning, self.assumed)
 
     def initial(self, episodes: Tensor) -> State:
         own = {"ego": self.reckoning.unknown(episodes)}
@@ -64,20 +66,27 @@ class Believing(IntervalPolicy):
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        points, ego = self.belief(observation, boxes), self.reckoning.now(boxes, state["ego"])
-        ego = Ego(*(value.expand(len(points), *value.shape) for value in ego))
+        if self.compiled.fits(observation, state):
+            signs = _signs(self.settings.corners, observation.shape[-2], observation.shape[-1] - 1)
+            points = self.compiled(observation, boxes, state["ego"], signs)
+        else:
+            points, ego = self.belief(observation, boxes), self.reckoning.now(boxes, state["ego"])
+            ego = Ego(*(value.expand(len(points), *value.shape) for value in ego))
+            points = corrected(points, ego, self.assumed)
         inner = state.get("inner", None)
         inner = None if inner is None else inner.expand(len(points), *state.batch_size)
-        values = self.policy.scores(corrected(points, ego, self.assumed), inner)
+        values = self.policy.scores(points, inner)
         lowest = values.amin(0)
         return values[0] + self.settings.pessimism * (lowest - values[0])
 
     def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
         assert state is not None
-        ego = self.reckoning.now(boxes, state["ego"])
-        middle = corrected(self.belief(observation, boxes, corners=False)[0], ego, self.assumed)
-        inner = self.policy.advance(middle, action, state.get("inner", None))
-        return with_inner({"ego": self.reckoning.after(ego, action)}, inner, state.batch_size)
+        ego, after = self.reckoning.step(boxes, state["ego"], action)
+        inner = state.get("inner", None)
+        if remembers(self.policy):
+            middle = corrected(self.belief(observation, boxes, corners=False)[0], ego, self.assumed)
+            inner = self.policy.advance(middle, action, inner)
+        return with_inner({"ego": after}, inner, state.batch_size)
 
     def safe(self, boxes: Boxes, state: State) -> None:
         """It promises nothing."""

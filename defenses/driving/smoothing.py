@@ -58,6 +58,6 @@ class Smoothed(PolicyWrapper):
 
     def noisy(self, observation: Tensor) -> Tensor:
         """The observation [..., V, F] with noise on the measured values of the rows that are present."""
-        present = observation[..., :1]
-        noise = torch.randn_like(observation[..., 1:]) * self.noise * (present > 0)
-        return torch.cat((present, observation[..., 1:] + noise), -1)
+        shift = torch.zeros_like(observation)
+        shift[..., 1:] = torch.randn_like(observation[..., 1:]) * self.noise * (observation[..., :1] > 0)
+        return observation + shift

@@ -20,6 +20,11 @@ ACTIVATIONS: dict[type[nn.Module] | None, int] = {
 }
 
 
+MANY = 4096
+"""Of more points than this a pass keeps nothing for the gradient. Only defences ask so many, and take the least of several
+answers: those that count are computed again."""
+
+
 class Fused:
     """A chain of linear layers, behind an encoder of the cars or alone, that is evaluated without torch.
 
@@ -59,6 +64,11 @@ class Fused:
         self.width, self.pooled = (car.out_features, pair.out_features) if car and pair else (0, 0)
         self.last = kernels.DUELING if dueling else kernels.PLAIN if scale is None else kernels.SCALED
 
+    @property
+    def dimensions(self) -> int:
+        """Dimensions of an observation: [V, F], or [n] without an encoder."""
+        return 2 if self.width else 1
+
     def fits(self, observation: Tensor) -> bool:
         """Whether it can answer about observations [..., V, F], or [..., n] without an encoder."""
         if observation.dtype != torch.float32 or observation.device.type != "cpu" or torch.compiler.is_compiling():
@@ -90,7 +100,7 @@ class Fused:
 
     def forward(self, observation: Tensor, *, keeps: bool) -> tuple[Tensor, Any]:
         """The answers [..., A], and what the gradient needs besides them (`kernels.forward`)."""
-        leading = observation.shape[: -2 if self.width else -1]
+        leading = observation.shape[: -self.dimensions]
         count = leading.numel()
         points = observation.detach().reshape(count, observation.shape[len(leading) :].numel()).contiguous().numpy()
         weights = torch.cat(_VIEWS[self]).numpy()
@@ -165,14 +175,26 @@ def _flat(network: object) -> Iterator[Any]:
 class _Pass(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, observation: Tensor, network: Fused) -> Tensor:
-        answer, ctx.kept = network.forward(observation, keeps=True)
         ctx.shape, ctx.network = observation.shape, network
+        ctx.lean = observation.shape[: -network.dimensions].numel() > MANY
+        answer, ctx.kept = network.forward(observation, keeps=not ctx.lean)
         return answer
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_answer: Tensor) -> tuple[Tensor, None]:
-        by_points = np.empty_like(ctx.kept[0])
-        by_out = by_answer.detach().reshape(len(by_points), ctx.network.outputs).contiguous().numpy()
-        kernels.backward(*ctx.kept, by_out, by_points)
-        return torch.from_numpy(by_points).view(ctx.shape), None
+        points, network = ctx.kept[0], ctx.network
+        by_out = by_answer.detach().reshape(len(points), network.outputs).contiguous()
+        if not ctx.lean:
+            by_points = np.empty_like(points)
+            kernels.backward(*ctx.kept, by_out.numpy(), by_points)
+            return torch.from_numpy(by_points).view(ctx.shape), None
+        asked = by_out.any(1).nonzero().squeeze(1)
+        found = torch.zeros(points.shape)
+        if len(asked):
+            some = torch.from_numpy(points)[asked]
+            kept = network.forward(some.view(-1, *ctx.shape[len(ctx.shape) - network.dimensions :]), keeps=True)[1]
+            by_points = np.empty_like(kept[0])
+            kernels.backward(*kept, by_out[asked].numpy(), by_points)
+            found[asked] = torch.from_numpy(by_points)
+        return found.view(ctx.shape), None

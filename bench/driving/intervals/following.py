@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -52,29 +53,33 @@ class FollowingDistance:
         cases: tuple[Case, ...] = (Case(),),
         braking: float | None = None,
     ) -> None:
-        speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
-        rates = torch.arange(HARDEST * LEVELS_PER_UNIT + 1.0, dtype=torch.float64) / LEVELS_PER_UNIT
-        dt = period / kinematics.frames
+        self.side = round(FASTEST / STEP) + 1
+        self.tables = np.stack([_table(kinematics, period, seconds, case, braking) for case in cases])
 
-        def table(case: Case) -> NDArray[np.float32]:
-            rate, own, other = torch.meshgrid(rates, speeds, speeds, indexing="ij")
-            most, lost, target = torch.zeros_like(own), torch.zeros_like(own), own
-            # The leader has braked for one decision when the ego begins to.
-            other = (other - rate * min(period, seconds)).clamp(min=0)
-            for frame in range(round(case.within / dt)):
-                holds = frame * dt < case.held - 1e-9
-                if not holds and frame % kinematics.frames == 0:
-                    target = slower(own, kinematics.target_speeds)
-                lost = lost + (own - other) * dt
-                most = torch.maximum(most, lost)
-                braked = kinematics.speed_gain * (target - own) if braking is None else torch.full_like(own, -braking)
-                own = own if holds else (own + braked * dt).clamp(min=0)
-                if period + frame * dt < seconds - 1e-9:
-                    other = (other - rate * dt).clamp(min=0)
-            return most.float().flatten().numpy()
 
-        self.side = len(speeds)
-        self.tables = np.stack([table(case) for case in cases])
+@cache
+def _table(
+    kinematics: Kinematics, period: float, seconds: float, case: Case, braking: float | None
+) -> NDArray[np.float32]:
+    """The following distances of a case, [rates * speeds * speeds]; arguments as of `FollowingDistance`."""
+    speeds = torch.arange(0.0, FASTEST + STEP, STEP, dtype=torch.float64)
+    rates = torch.arange(HARDEST * LEVELS_PER_UNIT + 1.0, dtype=torch.float64) / LEVELS_PER_UNIT
+    dt = period / kinematics.frames
+    rate, own, other = torch.meshgrid(rates, speeds, speeds, indexing="ij")
+    most, lost, target = torch.zeros_like(own), torch.zeros_like(own), own
+    # The leader has braked for one decision when the ego begins to.
+    other = (other - rate * min(period, seconds)).clamp(min=0)
+    for frame in range(round(case.within / dt)):
+        holds = frame * dt < case.held - 1e-9
+        if not holds and frame % kinematics.frames == 0:
+            target = slower(own, kinematics.target_speeds)
+        lost = lost + (own - other) * dt
+        most = torch.maximum(most, lost)
+        braked = kinematics.speed_gain * (target - own) if braking is None else torch.full_like(own, -braking)
+        own = own if holds else (own + braked * dt).clamp(min=0)
+        if period + frame * dt < seconds - 1e-9:
+            other = (other - rate * dt).clamp(min=0)
+    return most.float().flatten().numpy()
 
 
 def slower(speed: Tensor, target_speeds: tuple[float, ...]) -> Tensor:

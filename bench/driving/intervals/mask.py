@@ -32,6 +32,15 @@ class Weighed(NamedTuple):
     safe: Tensor
 
 
+def compilable(observation: Tensor, state: TensorDictBase) -> bool:
+    """Whether compiled loops can answer about observations [..., V, F] with the state of as many episodes."""
+    if observation.dtype != torch.float32 or observation.device.type != "cpu" or torch.compiler.is_compiling():
+        return False
+    if observation.shape[-2] < 2 or torch._C._are_functorch_transforms_active():
+        return False
+    return state.batch_size == observation.shape[:-2]
+
+
 class Mask:
     """The same as `ego.DeadReckoning.now`, `policy.corrected`, `margins.Judge` and the mask of a filter.
 
@@ -52,11 +61,7 @@ class Mask:
 
     def fits(self, observation: Tensor, state: TensorDictBase) -> bool:
         """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
-        if observation.dtype != torch.float32 or observation.device.type != "cpu" or torch.compiler.is_compiling():
-            return False
-        if observation.shape[-2] < 2 or torch._C._are_functorch_transforms_active():
-            return False
-        return state.batch_size == observation.shape[:-2]
+        return compilable(observation, state)
 
     def __call__(self, observation: Tensor, boxes: Boxes, ego: TensorDictBase) -> Weighed:
         """What the filter makes of observations that it `fits`, differentiable once in them and in the boxes.

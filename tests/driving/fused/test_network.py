@@ -183,3 +183,25 @@ def test_a_hook_still_hears_every_evaluation() -> None:
 )
 def test_other_networks_are_left_to_torch(network: object) -> None:
     assert chain(network) is None
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.7])
+def test_answers_that_do_not_matter_change_no_gradient(
+    policy: Policy, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a defence that takes the least of many answers: few are differentiated, with the bits that all would have."""
+    x = observation((200,))
+    monkeypatch.setattr("cavbench.driving.fused.network.MANY", 150)
+    weights = torch.rand(200, 1, generator=torch.Generator().manual_seed(2))
+    weights = weights * (torch.arange(200) % 100 < 100 * share)[:, None]
+
+    def both(rows: Tensor) -> Tensor:
+        asked = x[rows].requires_grad_()
+        return torch.autograd.grad((policy.scores(asked) * weights[rows]).sum(), asked)[0]
+
+    sparse, matters = both(torch.arange(200)), (weights[:, 0] > 0).nonzero().squeeze(1)
+    if share:
+        assert len(matters) < 150
+        assert torch.equal(sparse[matters], both(matters))
+    assert not sparse[weights[:, 0] == 0].any()
+    assert bool(sparse.any()) == (share > 0)

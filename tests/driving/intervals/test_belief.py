@@ -1,0 +1,134 @@
+"""The compiled belief: torch's points to the last bit and torch's gradients, in every batch, and torch where more is wanted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from unittest.mock import patch
+
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tensordict import TensorDict
+from torch import Tensor
+
+from cavbench.defenses.driving.pessimist_q import Believing, PessimistQ
+from cavbench.defenses.driving.tracker import Tracked, Tracker
+from cavbench.driving import Policy
+from cavbench.driving.intervals import belief_kernels
+from cavbench.driving.intervals.belief import Belief
+from cavbench.driving.victims.networks import QPolicy
+from tests.driving.intervals.drivers import FACTS
+from tests.driving.intervals.test_mask import drawn
+
+
+class Points(Policy):
+    """Scores that say all about an observation: weighted sums with bends, so that every point of a belief counts."""
+
+    action_type = "discrete"
+
+    def forward(self, observation: Tensor) -> Tensor:
+        flat = observation.flatten(-2)
+        generator = torch.Generator().manual_seed(7)
+        weights = torch.randn(flat.shape[-1], len(FACTS.actions), generator=generator)
+        return (flat + 0.3 * flat.abs()) @ weights
+
+
+def believing(policy: Policy | None = None, *, any_start: bool = False, pessimism: float = 0.7) -> Believing:
+    torch.manual_seed(3)
+    assert FACTS.kinematics is not None
+    kinematics = replace(FACTS.kinematics, start_speed=None if any_start else FACTS.kinematics.start_speed)
+    behind = policy or QPolicy(5, len(FACTS.actions), 16).requires_grad_(False)
+    return Believing(PessimistQ(pessimism=pessimism), behind, replace(FACTS, kinematics=kinematics)).eval()
+
+
+def by_torch() -> object:
+    return patch.object(Belief, "fits", lambda self, observation, state: False)
+
+
+class Asked(Policy):
+    """Notes what it is asked."""
+
+    action_type = "discrete"
+
+    def forward(self, observation: Tensor) -> Tensor:
+        self.asked = observation
+        return observation.flatten(-2)[..., : len(FACTS.actions)]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), any_start=st.booleans())
+def test_points_are_those_of_torch_to_the_last_bit(seed: int, any_start: bool) -> None:
+    policy, (shown, state) = believing(asked := Asked(), any_start=any_start), drawn(seed, 200)
+    with patch.object(belief_kernels, "believe", side_effect=belief_kernels.believe) as compiled:
+        scores = policy.scores(shown, state)
+        assert compiled.call_count == 1
+        points = asked.asked
+        with by_torch():
+            assert torch.equal(policy.scores(shown, state), scores)
+        assert compiled.call_count == 1
+    assert torch.equal(points, asked.asked)
+    # The corners differ from the middle, and the reckoned ego from the shown one.
+    assert float((points[1:] != points[:1]).float().mean()) > 0.2
+    assert not torch.equal(points[:, :, 0, 1:].mean(0), shown[:, 0, 1:])
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000), any_start=st.booleans(), network=st.booleans())
+def test_gradients_are_those_of_torch(seed: int, any_start: bool, network: bool) -> None:
+    policy = believing(None if network else Points(), any_start=any_start)
+    shown, state = drawn(seed, 200)
+    weights = torch.randn(200, len(FACTS.actions), generator=torch.Generator().manual_seed(seed))
+
+    def slope() -> Tensor:
+        asked = shown.clone().requires_grad_()
+        return torch.autograd.grad((policy.scores(asked, state) * weights).sum(), asked)[0]
+
+    compiled = slope()
+    with by_torch():
+        reference = slope()
+    largest = reference.abs().flatten(1).amax(1)
+    assert float(largest.median()) > 0.01
+    apart = (compiled - reference).abs().flatten(1).amax(1)
+    # Where large terms cancel, more of what is left is rounding.
+    assert bool((apart <= 1e-5 * (largest + 0.1)).all())
+
+
+def test_a_row_has_the_same_bits_in_every_batch_and_place() -> None:
+    policy, (shown, state) = believing(), drawn(1, 120)
+
+    def both(rows: Tensor) -> tuple[Tensor, Tensor]:
+        asked = shown[rows].requires_grad_()
+        scores = policy.scores(asked, state[rows])
+        return scores.detach(), torch.autograd.grad(scores.sum(), asked)[0]
+
+    scores, slopes = both(torch.arange(120))
+    for rows in (torch.arange(120).flip(0), torch.tensor([7]), torch.arange(40, 73), torch.tensor([5, 5, 90])):
+        part, slope = both(rows)
+        assert torch.equal(part, scores[rows])
+        assert torch.equal(slope, slopes[rows])
+
+
+def test_several_leading_dimensions_and_no_points_are_answered() -> None:
+    policy, (shown, state) = believing(), drawn(2, 60)
+    flat = policy.scores(shown, state)
+    folded = shown.unflatten(0, (4, 15))
+    assert torch.equal(policy.scores(folded, state.reshape(4, 15)).flatten(0, 1), flat)
+    assert policy.scores(shown[:0], state[:0]).shape == (0, len(FACTS.actions))
+
+
+def test_a_tracked_belief_drives_as_by_torch() -> None:
+    """Scores and states over several decisions, with the boxes of the tracker in front."""
+    shown, _ = drawn(5, 80)
+    policy = Tracked(Tracker(), believing(), FACTS).eval()
+    state = other = policy.initial(torch.arange(80))
+    for step in range(6):
+        moved = shown.clone()
+        moved[..., 1] = (moved[..., 1] + 0.002 * step * moved[..., 0]).clamp(-1, 1)
+        scores = policy.scores(moved, state)
+        with by_torch():
+            assert torch.equal(policy.scores(moved, other), scores)
+            other = policy.advance(moved, scores.argmax(-1), other)
+        state = policy.advance(moved, scores.argmax(-1), state)
+    assert isinstance(state, TensorDict)
+    assert isinstance(other, TensorDict)
+    assert (state == other).all()
