@@ -176,6 +176,17 @@ FACES: tuple[pa.Field, ...] = (
 )
 """What is detected on faces that are kept back from trainings; null in older records and where an approach shows none."""
 
+CERTIFIED_FRAMES: tuple[pa.Field, ...] = (
+    field(
+        "frame_certified",
+        pa.list_(FLOAT),
+        "of each frame: frame_confidence at least, whatever the patch shows; null without a certificate or an attack",
+        "0 to 1",
+        nullable=True,
+    ),
+)
+"""The certificate frame by frame; null in older records."""
+
 CLOSED_LOOP: tuple[pa.Field, ...] = (
     field(
         "stopped",
@@ -229,8 +240,10 @@ class DetectionTrack(Track):
         *CERTIFIED,
         NAN_GRADIENTS,
         *FACES,
+        *CERTIFIED_FRAMES,
     )
-    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in FACES)
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*FACES, *CERTIFIED_FRAMES))
+    certificates: ClassVar[str] = "frame_certified"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"
     metric_title: ClassVar[str] = "stop score"
