@@ -79,9 +79,10 @@ def _of_faces(sight: Sight | None, scenes: Scenes) -> dict[str, float]:
 def certified(
     least: Sequence[NDArray[np.float32] | None], seen: Sequence[Sight], decoys: Sequence[Sight | None]
 ) -> dict[str, NDArray[np.generic]]:
-    """`stop_score` of A approaches with the certified confidence in the sign, [A], and that confidence in each frame, lists [A].
+    """The certificate of A approaches: `stop_score` with the certified confidence in the sign, and this of each frame, [A] lists.
 
-    Without a certificate they are NaN and None. No patch lowers the confidence below the certificate, and decoys carry none, so `stop_score` is at least this.
+    They are NaN and None without a certificate. No patch lowers the confidence below the certificate, and decoys carry none, so
+    `stop_score` is at least this.
 
     Args:
         least: the certified confidence in each frame; None without a certificate.

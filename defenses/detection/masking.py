@@ -118,7 +118,8 @@ class Masking(DetectorDefense):
     sign there is a window in which the patch is hidden, and a detection there counts, whatever is detected elsewhere. The windows
     are the same in all images. The detector's own predictions are kept, so the sign is never seen worse than without the defence.
 
-    The network meets no detector and no attack of the benchmark, so one serves all victims. It learns from clean training frames with signs and decoys.
+    The network meets no detector and no attack of the benchmark, so one serves all victims. It learns from clean training frames
+    with signs and decoys.
 
     Args:
         updates: weight updates of the training.

@@ -12,7 +12,7 @@ from rich.text import Text
 from cavbench.leaderboard.comparisons.comparison import ENOUGH_SEEDS
 from cavbench.leaderboard.comparisons.pairing import beside
 from cavbench.leaderboard.terminal.text import bounds, change
-from cavbench.leaderboard.thesis.patch_records import ABLATION, LOCATIONS, STANDARD, WEATHERS, Detector, Source
+from cavbench.leaderboard.thesis.patch_records import ABLATION, COVERS, LOCATIONS, STANDARD, WEATHERS, Detector, Source
 from cavbench.leaderboard.thesis.trend import LEVEL, trend
 from cavbench.statistics.episodes import shared
 from cavbench.statistics.estimates import Array, interval

@@ -57,7 +57,7 @@ def test_a_network_of_its_own_goes_before_the_shared_one_and_none_at_all_is_refu
 ) -> None:
     monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
     monkeypatch.setattr(shared, "HOST", RedVictim())
-    with pytest.raises(UserError, match="bench train .*defense=segmenter"):
+    with pytest.raises(UserError, match=r"bench train .*defense=segmenter"):
         QUICK.load(victim, 0, FACTS)
 
     def trained(beside: YOLOv5 | RedVictim, seed: int) -> list[Tensor]:
