@@ -61,6 +61,8 @@ class Transformations:
         """Transform images [N, 3, H, W] in [0, 1]; differentiable in the pixels inside `boxes` [N, 4]."""
         shape = pictures.shape
         self._matrices = []
+        if not (self.warps or self.jiggle or self.noise):
+            return pictures
         for warp, beyond in self.warps:
             matrices = warp.compute_transformation(pictures, warp.forward_parameters(shape), warp.flags)
             self._matrices.append(matrices)

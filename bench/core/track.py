@@ -206,6 +206,8 @@ class Track(ABC):
     """The baseline that knows all: with that of `contrast` it makes the scale on which worlds are compared. Empty for none."""
     contrast: ClassVar[Contrast | None] = None
     """The baseline that attacked pairs are compared with; None for none."""
+    certificates: ClassVar[str] = ""
+    """The list of what is certified of an episode, in [0, 1], frame by frame; reports draw its histogram. Empty for none."""
     place: ClassVar[str] = ""
     """The measurement that names the location of an episode; tables of a pair have one row per location. Empty for none."""
     queries: ClassVar[str] = "queries"

@@ -79,9 +79,10 @@ def _of_faces(sight: Sight | None, scenes: Scenes) -> dict[str, float]:
 def certified(
     least: Sequence[NDArray[np.float32] | None], seen: Sequence[Sight], decoys: Sequence[Sight | None]
 ) -> dict[str, NDArray[np.generic]]:
-    """`stop_score` of A approaches with the certified confidence in the sign, [A]; NaN without a certificate.
+    """The certificate of A approaches: `stop_score` with the certified confidence in the sign, and this of each frame, [A] lists.
 
-    No patch lowers the confidence below the certificate, and decoys carry none, so `stop_score` is at least this.
+    They are NaN and None without a certificate. No patch lowers the confidence below the certificate, and decoys carry none, so
+    `stop_score` is at least this.
 
     Args:
         least: the certified confidence in each frame; None without a certificate.
@@ -91,16 +92,17 @@ def certified(
     Raises:
         UserError: if the confidence is below the certificate in a frame.
     """
-    found = []
-    for certain, sight, other in zip(least, seen, decoys, strict=True):
+    found, frames = [], np.full(len(least), None, object)
+    for place, (certain, sight, other) in enumerate(zip(least, seen, decoys, strict=True)):
         if certain is None:
             found.append(np.nan)
             continue
+        frames[place] = certain.astype(np.float64).tolist()
         if (short := float((certain - sight.confidence).max())) > ROUNDING:
             raise UserError(f"the certificate is false: the confidence in a frame is {short:.3f} below it")
         of_decoys = 0.0 if other is None else float(other.confidence.mean(dtype=np.float64))
         found.append(max(0.0, float(certain.mean(dtype=np.float64)) - of_decoys))
-    return {"certified": np.array(found)}
+    return {"certified": np.array(found), "frame_certified": frames}
 
 
 def if_visible(seen: Sequence[Sight], scenes: Sequence[Scenes]) -> dict[str, NDArray[np.generic]]:

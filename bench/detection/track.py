@@ -21,8 +21,10 @@ from cavbench.scenarios import Cell
 if TYPE_CHECKING:
     from cavbench.recording.film import Film
 
-REFERENCE_PATCHES = ("noise_patch", "grey_patch")
+REFERENCE_PATCHES = ("noise_patch", "grey_patch", "plain_patch")
 """Baseline patches, not optimised against the detector: they measure the effect of covering the sign."""
+COLOURS: Mapping[str, tuple[dict[str, str], ...]] = {"plain_patch": ({"colour": "black"}, {"colour": "blue"})}
+"""The parameters of baseline patches that there are several of: the one with the lowest score counts in each cell."""
 
 MEASUREMENTS: tuple[pa.Field, ...] = (
     field("location", TEXT, "of the approach"),
@@ -174,6 +176,17 @@ FACES: tuple[pa.Field, ...] = (
 )
 """What is detected on faces that are kept back from trainings; null in older records and where an approach shows none."""
 
+CERTIFIED_FRAMES: tuple[pa.Field, ...] = (
+    field(
+        "frame_certified",
+        pa.list_(FLOAT),
+        "of each frame: frame_confidence at least, whatever the patch shows; null without a certificate or an attack",
+        "0 to 1",
+        nullable=True,
+    ),
+)
+"""The certificate frame by frame; null in older records."""
+
 CLOSED_LOOP: tuple[pa.Field, ...] = (
     field(
         "stopped",
@@ -227,8 +240,10 @@ class DetectionTrack(Track):
         *CERTIFIED,
         NAN_GRADIENTS,
         *FACES,
+        *CERTIFIED_FRAMES,
     )
-    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in FACES)
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*FACES, *CERTIFIED_FRAMES))
+    certificates: ClassVar[str] = "frame_certified"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"
     metric_title: ClassVar[str] = "stop score"
@@ -261,6 +276,7 @@ class DetectionTrack(Track):
     baseline_kinds: ClassVar[Mapping[str, Baseline]] = {
         "noise_patch": Baseline(title="noise patch", heading="\nnoise", spare=1),
         "grey_patch": Baseline(title="grey patch", heading="\ngrey", spare=1),
+        "plain_patch": Baseline(title="plain patch", heading="\nplain", spare=1),
     }
     contrast: ClassVar[Contrast | None] = Contrast(
         side="attack", title="the best baseline patch", heading="beyond best\nbaseline"
@@ -281,7 +297,8 @@ class DetectionTrack(Track):
         installed = registry.names("attack") if not pair.is_clean else []
         for name in REFERENCE_PATCHES:
             if name in installed and name != pair.attack.name:
-                yield replace(pair, attack=choose("attack", name))
+                for colour in COLOURS.get(name, ({},)):
+                    yield replace(pair, attack=choose("attack", name, **colour))
 
     def baseline_of(self, other: Mapping[str, object], own: Mapping[str, object]) -> str:
         same = (

@@ -26,6 +26,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
+from torch.nn import Module
 
 from cavbench import bounded
 from cavbench.core.contracts import World
@@ -155,20 +156,13 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
         UserError: if there is no such entry, a default has changed since, the weights do not match the card, an adversary
             was trained against other weights, or a training started from others.
     """
-    path, entry = _find(recipe, seed), card(recipe, seed)
-    _check_parameters(recipe, seed, entry)
+    path, entry = _entry(recipe, seed)
     if against and (before := entry.get("against")) != against:
         raise UserError(
             f"the zoo's {recipe.name!r} of training seed {seed} was trained against a victim with weights {str(before)[:12]}…, "
             f"and the victim has {against[:12]}… now; `{recipe.train(seed)}` trains it again"
         )
-    blob = bounded.content(path, most=bounded.WEIGHTS, name=f"the weights {path}")
-    sha256 = hashlib.sha256(blob).hexdigest()
-    if sha256 != entry.get("sha256"):
-        raise UserError(
-            f"the weights {path} have sha256 {sha256[:12]}…, their card says {str(entry.get('sha256'))[:12]}…: "
-            "the file was changed; restore it or train it again"
-        )
+    blob, sha256 = _weights(path, entry)
     try:
         tensors: Mapping[str, Tensor] = load_tensors(blob)
         begun = entry.get("start")
@@ -197,6 +191,31 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
     return network
 
 
+def load_part(recipe: Recipe, seed: int, name: str, part: Module) -> str:
+    """Fill a part of an entry's network without the rest of it, and return the hash of the entry's weights.
+
+    It is for a part whose training the rest played no part in.
+
+    Args:
+        recipe: the entry's recipe.
+        seed: training seed.
+        name: of the part in the entry's network.
+        part: the part, which gets the weights.
+
+    Raises:
+        UserError: as `load`, but the network that the training started from is not looked at.
+    """
+    path, entry = _entry(recipe, seed)
+    blob, sha256 = _weights(path, entry)
+    start = f"{name}."
+    try:
+        stored = load_tensors(blob)
+        part.load_state_dict({key.removeprefix(start): own for key, own in stored.items() if key.startswith(start)})
+    except (SafetensorError, RuntimeError, ValueError) as error:
+        raise UserError(f"the weights {path} do not fit {recipe.name!r}: {message(error)}") from None
+    return sha256
+
+
 def own_files(recipe: Recipe, seed: int) -> tuple[Path, ...]:
     """The weights and the card of an entry of the user's zoo; empty if it has none, as for weights that ship in a package."""
     path = own() / recipe.key / f"seed{seed}.safetensors"
@@ -218,6 +237,25 @@ def missing(recipe: Recipe, seed: int) -> str:
     asked = " ".join([repr(recipe.name), *(["with", *recipe.options] if recipe.options else [])])
     variants = "; ".join(_variants(recipe)) or "none"
     return f"the zoo has no {asked} of training seed {seed}. Variants: {variants}. To train it: `{recipe.train(seed)}`"
+
+
+def _entry(recipe: Recipe, seed: int) -> tuple[Path, dict[str, Any]]:
+    """The weights file of an entry and its card."""
+    path, entry = _find(recipe, seed), card(recipe, seed)
+    _check_parameters(recipe, seed, entry)
+    return path, entry
+
+
+def _weights(path: Path, entry: Mapping[str, Any]) -> tuple[bytes, str]:
+    """The content of a weights file and its hash, which is that of the card."""
+    blob = bounded.content(path, most=bounded.WEIGHTS, name=f"the weights {path}")
+    sha256 = hashlib.sha256(blob).hexdigest()
+    if sha256 != entry.get("sha256"):
+        raise UserError(
+            f"the weights {path} have sha256 {sha256[:12]}…, their card says {str(entry.get('sha256'))[:12]}…: "
+            "the file was changed; restore it or train it again"
+        )
+    return blob, sha256
 
 
 def _check_parameters(recipe: Recipe, seed: int, entry: Mapping[str, Any]) -> None:

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import softplus
 
-from cavbench import zoo
 from cavbench.core.contracts import Facts, Progress, Trained
 from cavbench.core.ranges import Count, Natural, Positive
+from cavbench.defenses.detection import shared
 from cavbench.defenses.detection.judge import (
     COARSER,
     COVER,
@@ -118,7 +118,8 @@ class Masking(DetectorDefense):
     sign there is a window in which the patch is hidden, and a detection there counts, whatever is detected elsewhere. The windows
     are the same in all images. The detector's own predictions are kept, so the sign is never seen worse than without the defence.
 
-    The network meets no detector and no attack of the benchmark. It learns from clean training frames with signs and decoys.
+    The network meets no detector and no attack of the benchmark, so one serves all victims. It learns from clean training frames
+    with signs and decoys.
 
     Args:
         updates: weight updates of the training.
@@ -142,9 +143,12 @@ class Masking(DetectorDefense):
         return f"{victim.zoo_name()}-masking"
 
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
-        recipe = zoo.Recipe.of(victim, self)
         judge = Judge()
-        network = zoo.load(recipe, self.trained, lambda **_: _around(victim.load(seed, facts), judge))
+
+        def defended() -> Masked:
+            return _around(victim.load(seed, facts), judge)
+
+        network = shared.load(self, victim, self.trained, name="judge", part=judge, defended=defended)
         judge.freeze()
         return network
 

@@ -11,9 +11,9 @@ from annotated_types import Interval
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate, max_pool2d
 
-from cavbench import zoo
 from cavbench.core.contracts import Facts, Progress, Trained
 from cavbench.core.ranges import Count, Natural, Positive, Share
+from cavbench.defenses.detection import shared
 from cavbench.defenses.detection.completion import closed, filled
 from cavbench.defenses.detection.marker import Marker
 from cavbench.defenses.detection.textures import textures
@@ -117,8 +117,12 @@ class Segmenter(DetectorDefense):
         return f"{victim.zoo_name()}-segmenter"
 
     def load(self, victim: DetectorVictim, seed: int, facts: Facts) -> Detector:
-        recipe = zoo.Recipe.of(victim, replace(self, certainty=CERTAINTY))
-        return zoo.load(recipe, self.trained, lambda **_: self._around(victim.load(seed, facts), Marker()))
+        as_trained, marker = replace(self, certainty=CERTAINTY), Marker()
+
+        def defended() -> Completed:
+            return self._around(victim.load(seed, facts), marker)
+
+        return shared.load(as_trained, victim, self.trained, name="marker", part=marker, defended=defended)
 
     def train(self, victim: DetectorVictim, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
         """Train the U-Net of training seed `seed`. The victim plays no part: all get the same U-Net.

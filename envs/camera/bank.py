@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict
 from functools import cache
@@ -21,8 +21,9 @@ from cavbench.detection import Decoy, Objects, Scenes
 from cavbench.detection.mount import Mount
 from cavbench.envs.camera import faces, sign, training_faces, training_signs
 from cavbench.envs.camera.frame import Frame, noise_level
+from cavbench.envs.camera.layers import joined
 from cavbench.envs.camera.objects import objects
-from cavbench.envs.camera.plate import Box, Plate, common, detail, filtered, opened, within
+from cavbench.envs.camera.plate import Box, Plate, common, detail, filtered, opened, signed, within
 from cavbench.envs.camera.poses import Pose
 from cavbench.envs.camera.street.layout import sign_x
 from cavbench.envs.weather import WEATHERS
@@ -30,6 +31,8 @@ from cavbench.errors import UserError
 from cavbench.files import whole
 
 SHIPPED = Path(__file__).parent / "data"
+Taken = Callable[[Tensor, int, Box], Tensor]
+"""Makes what the camera takes of a developed part [3, h, w] of the image of a frame: the part, the frame, where the part is."""
 
 
 def path_of(folder: Path, location: str, weather: str) -> Path:
@@ -168,7 +171,8 @@ class BankScenes(Scenes):
         return Objects(torch.from_numpy(boxes).float(), tuple(name for name, _ in found))
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        return self.with_noise(self.developed(frames, patches, share), frames)
+        corners = torch.zeros(len(frames), 2, dtype=torch.int64)
+        return self.windows(frames, patches, share, corners, self.size)
 
     def render_decoys(self, frames: Tensor) -> Tensor:
         return self.with_noise(self.developed_decoys(frames), frames)
@@ -176,14 +180,12 @@ class BankScenes(Scenes):
     def windows(
         self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
     ) -> Tensor:
-        shown = self._developed(frames, patches, share, corners, size)
-        parts = [(x, y, x + size[1], y + size[0]) for x, y in corners.tolist()]
-        return torch.stack([self._noisy(*one) for one in zip(shown, frames.tolist(), parts, strict=True)])
+        return self._shown(frames, patches, share, corners, size, self._noisy)
 
     def developed(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
         """The images of `render` without sensor noise."""
         corners = torch.zeros(len(frames), 2, dtype=torch.int64)
-        return torch.stack(self._developed(frames, patches, share, corners, self.size))
+        return self._shown(frames, patches, share, corners, self.size, _as_it_is)
 
     def developed_decoys(self, frames: Tensor) -> Tensor:
         """The images of `render_decoys` without sensor noise."""
@@ -198,43 +200,71 @@ class BankScenes(Scenes):
             [self._noisy(picture, number, whole) for picture, number in zip(pictures, frames.tolist(), strict=True)]
         )
 
-    def _developed(
-        self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int]
-    ) -> list[Tensor]:
-        """Windows of the images without sensor noise, [3, h, w] each."""
-        if patches is not None and self.mount.appears:
-            return self._plates_alone(frames, patches, share, corners, size)
+    def _shown(
+        self, frames: Tensor, patches: Tensor | None, share: float, corners: Tensor, size: tuple[int, int], taken: Taken
+    ) -> Tensor:
+        """Windows [N, 3, h, w] of the images, as `taken` makes them of developed ones."""
         numbers = frames.tolist()
-        faces: dict[tuple[int, sign.Colour], tuple[Tensor, ...]] = {}
-        beside = patches is not None and self.mount.place == "beside"
-        if patches is not None and not beside:
-            kinds = {_kind(self._plate(number)) for number in numbers}
-            painted = {printed: sign.painted(patches, share, printed, self.mount) for _, printed in kinds}
-            faces = {(side, printed): filtered(painted[printed], side).unbind() for side, printed in kinds}
-        shown = []
-        for place, (number, (x, y)) in enumerate(zip(numbers, corners.tolist(), strict=True)):
-            plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
-            picture = plate.cut(window)
-            reach = _reach(self.poses[number], share, self.mount)
-            patched = common(window, reach) if beside else common(window, plate.crop, reach)
-            if patches is not None and patched:
-                patch, where = place % len(patches), within(patched, window)
-                if beside:
-                    (spot,) = self.mount.spots(share)
-                    picture[where] = plate.beside(picture[where], patched, patches[patch], spot)
-                else:
-                    picture[where] = plate.signed(faces[_kind(plate)][patch], patched)
-            shown.append(picture)
-        return shown
+        windows = [(x, y, x + size[1], y + size[0]) for x, y in corners.tolist()]
+        if patches is not None and self.mount.appears:
+            shown = self._plates_alone(numbers, patches, share, windows)
+            return torch.stack([taken(*one) for one in zip(shown, numbers, windows, strict=True)])
+        with torch.no_grad():
+            plain = [
+                taken(self._plate(number).cut(window), number, window)
+                for number, window in zip(numbers, windows, strict=True)
+            ]
+        pictures = torch.stack(plain)
+        if patches is None:
+            return pictures
+        where, parts = [], []
+        for place, part, picture in self._patched(numbers, patches, share, windows):
+            _, rows, columns = within(part, windows[place])
+            where.append((place, rows, columns))
+            parts.append(taken(picture, numbers[place], part))
+        return joined(pictures, where, parts)
+
+    def _patched(
+        self, numbers: Sequence[int], patches: Tensor, share: float, windows: Sequence[Box]
+    ) -> Iterator[tuple[int, Box, Tensor]]:
+        """The developed parts [3, h, w] of windows that a patch changes: the number of the window, the part, its pixels."""
+        beside = self.mount.place == "beside"
+        found: list[tuple[int, Box]] = []
+        for place, (number, window) in enumerate(zip(numbers, windows, strict=True)):
+            reach, crop = _reach(self.poses[number], share, self.mount), self._plate(number).crop
+            if part := common(window, reach) if beside else common(window, crop, reach):
+                found.append((place, part))
+        if beside:
+            (spot,) = self.mount.spots(share)
+            for place, part in found:
+                plate = self._plate(numbers[place])
+                shown = plate.cut(part)
+                yield place, part, plate.beside(shown, part, patches[place % len(patches)], spot)
+            return
+        plates = {place: self._plate(numbers[place]) for place, _ in found}
+        painted = {plate.printed: None for plate in plates.values()}
+        lit = {printed: sign.painted(patches, share, printed, self.mount) for printed in painted}
+        faces = {
+            (side, printed): filtered(lit[printed], side).unbind()
+            for side, printed in dict.fromkeys(_kind(plate) for plate in plates.values())
+        }
+        # Parts with the same face come together: so the face has one gradient.
+        alike: dict[tuple[tuple[int, sign.Colour], int], list[tuple[int, Box]]] = {}
+        for place, part in found:
+            alike.setdefault((_kind(plates[place]), place % len(patches)), []).append((place, part))
+        for (kind, patch), same in alike.items():
+            own = [(plates[place], part) for place, part in same]
+            for (place, part), picture in zip(same, signed(faces[kind][patch], own), strict=True):
+                yield place, part, picture
 
     def _plates_alone(
-        self, frames: Tensor, patches: Tensor, share: float, corners: Tensor, size: tuple[int, int]
+        self, numbers: Sequence[int], patches: Tensor, share: float, windows: Sequence[Box]
     ) -> list[Tensor]:
-        """As `_developed`, with each patch on a plate of its own, on the post without the sign."""
+        """Developed windows [3, h, w] with each patch on a plate of its own, on the post without the sign."""
         cover, shown = self.mount.cover(share, sign.TEXELS), []
         light = sign.painted(patches, share, mount=self.mount)
-        for place, (number, (x, y)) in enumerate(zip(frames.tolist(), corners.tolist(), strict=True)):
-            plate, window = self._plate(number), (x, y, x + size[1], y + size[0])
+        for place, (number, window) in enumerate(zip(numbers, windows, strict=True)):
+            plate = self._plate(number)
             face = faces.Face(light[place % len(light)] * torch.tensor(plate.printed).view(3, 1, 1), cover)
             shown.append(plate.carrying(face)[within(window, (0, 0, 0, 0))])
         return shown
@@ -268,6 +298,10 @@ class TrainingScenes(BankScenes):
     def redrawn(self, number: int, like_signs: bool = False) -> BankScenes:
         source = training_signs if like_signs else training_faces
         return self.with_decoys(source.decoys(number * len(self), len(self)))
+
+
+def _as_it_is(picture: Tensor, number: int, part: Box) -> Tensor:
+    return picture
 
 
 def _kind(plate: Plate) -> tuple[int, sign.Colour]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -62,8 +63,8 @@ class Plate:
             face: linear reflectances of the whole face [3, S, S], with S = `detail(crop)`.
             part: a non-empty box inside the crop.
         """
-        here = within(part, self.crop)
-        return develop.tone(self.black[here] + self.gain[here] * texture_mean(part, face, self.face_from_pixel))
+        (shown,) = signed(face, [(self, part)])
+        return shown
 
     def carrying(self, face: Face) -> Tensor:
         """The whole image with a decoy on the post, float32 [3, H, W]; where its plate is not, the background is filled in."""
@@ -105,7 +106,7 @@ class Plate:
             patch: sRGB in [0, 1], [3, P, P].
             spot: where the plate is in texture coordinates of the sign.
         """
-        if not self.lit.any():
+        if not common(self.crop) or not self.lit.any():
             return shown
         left, top, right, bottom = spot
         corner, sides = np.array([left, top], np.float32), np.array([right - left, bottom - top], np.float32)
@@ -161,11 +162,32 @@ def within(part: Box, whole: Box) -> tuple[slice, slice, slice]:
 
 def texture_mean(part: Box, face: Tensor, face_from_pixel: Array) -> Tensor:
     """Mean of the texture over the part of each pixel that the sign covers, [3, h, w]."""
+    place, weight = _weighted(part, face_from_pixel)
+    return _mean_at(face, place, weight)
+
+
+def signed(face: Tensor, parts: Sequence[tuple[Plate, Box]]) -> list[Tensor]:
+    """Developed parts [3, h, w] of the crops of plates with one texture on their signs; differentiable in the texture.
+
+    Args:
+        face: linear reflectances of the whole face [3, S, S], with S = `detail(crop)` of all plates.
+        parts: a plate and a non-empty box inside its crop each.
+    """
+    samples = [_weighted(part, plate.face_from_pixel) for plate, part in parts]
+    shown = []
+    for (plate, part), mean in zip(parts, _means_at(face, samples), strict=True):
+        here = within(part, plate.crop)
+        shown.append(develop.tone(plate.black[here] + plate.gain[here] * mean))
+    return shown
+
+
+def _weighted(part: Box, face_from_pixel: Array) -> tuple[NDArray[np.float32], Tensor]:
+    """Where the samples of the pixels are on the face [h * S, w * S, 2], and their weights [h * S, w * S]."""
     place, inside = _inside(part, face_from_pixel)
     cover = inside.mean((1, 3), np.float32, keepdims=True)
     # Where the tracer saw a corner of the sign but no sample hits it, the border texel is used.
     weight = np.where(cover > 0, inside / np.maximum(cover, 1e-6), np.float32(1)).reshape(place.shape[:2])
-    return _mean_at(face, place, torch.from_numpy(weight))
+    return place, torch.from_numpy(weight)
 
 
 def _mean_at(texels: Tensor, place: NDArray[np.float32], weight: Tensor) -> Tensor:
@@ -176,14 +198,25 @@ def _mean_at(texels: Tensor, place: NDArray[np.float32], weight: Tensor) -> Tens
         place: where the samples are on it, [h * SUPERSAMPLING, w * SUPERSAMPLING, 2].
         weight: of the samples, [h * SUPERSAMPLING, w * SUPERSAMPLING].
     """
+    (mean,) = _means_at(texels, [(place, weight)])
+    return mean
+
+
+def _means_at(texels: Tensor, samples: Sequence[tuple[NDArray[np.float32], Tensor]]) -> list[Tensor]:
+    """As `_mean_at`, for the samples of several parts: the texels are read once, and have one gradient."""
+    grid = np.concatenate([place.reshape(-1, 2) for place, _ in samples])
     found = torch.nn.functional.grid_sample(
         texels.unsqueeze(0),
-        torch.from_numpy(2 * place - 1).unsqueeze(0),
+        torch.from_numpy(2 * grid - 1)[None, :, None],
         mode="bilinear",
         padding_mode="border",
         align_corners=False,
     )
-    return torch.nn.functional.avg_pool2d(found * weight, SUPERSAMPLING)[0]
+    parts = found[0, :, :, 0].split([weight.numel() for _, weight in samples], 1)
+    return [
+        torch.nn.functional.avg_pool2d(part.unflatten(1, weight.shape) * weight, SUPERSAMPLING)
+        for part, (_, weight) in zip(parts, samples, strict=True)
+    ]
 
 
 def wholly_sign(part: Box, face_from_pixel: Array) -> Tensor:

@@ -9,11 +9,10 @@ from typing import Literal
 import numpy as np
 from rich.text import Text
 
-from cavbench.detection.track import REFERENCE_PATCHES
 from cavbench.leaderboard.comparisons.comparison import ENOUGH_SEEDS
 from cavbench.leaderboard.comparisons.pairing import beside
 from cavbench.leaderboard.terminal.text import bounds, change
-from cavbench.leaderboard.thesis.patch_records import ABLATION, LOCATIONS, STANDARD, WEATHERS, Detector, Source
+from cavbench.leaderboard.thesis.patch_records import ABLATION, COVERS, LOCATIONS, STANDARD, WEATHERS, Detector, Source
 from cavbench.leaderboard.thesis.trend import LEVEL, trend
 from cavbench.statistics.episodes import shared
 from cavbench.statistics.estimates import Array, interval
@@ -148,7 +147,7 @@ def _lost(source: Source, detector: Detector, weather: str) -> dict[int, list[fl
 
 def _below(source: Source, detector: Detector, weather: str) -> Text:
     found = [source.find(detector, STANDARD, weather, location) for location in LOCATIONS.values()]
-    whole = [each for each in found if each and set(REFERENCE_PATCHES) <= set(each.of.baselines)]
+    whole = [each for each in found if each and set(COVERS) <= set(each.of.baselines)]
     seeds = min((len(each.of.own.runs) for each in whole), default=0)
     beyond = [each.of.lead for each in whole if each.of.lead]
     if len(beyond) < len(LOCATIONS) or seeds < ENOUGH_SEEDS:

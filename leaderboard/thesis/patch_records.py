@@ -14,14 +14,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from cavbench.core.registry import Kind
-from cavbench.detection.track import REFERENCE_PATCHES, DetectionTrack
+from cavbench.detection.track import DetectionTrack
 from cavbench.identity.fingerprint import canonical
 from cavbench.leaderboard.comparisons.comparison import IDENTITY, NO_ATTACK, Comparison, parameters
 from cavbench.leaderboard.comparisons.reading import SCENARIO, groups, read_comparisons
 from cavbench.leaderboard.thesis.shipped import shipped as shipped_records
 
 ATTACK, WORLD, DETECTOR = "eot", "camera", "yolov3_tiny"
-CONTROLS = (*REFERENCE_PATCHES, NO_ATTACK)
+COVERS = ("noise_patch", "grey_patch")
+"""The thesis' patches that are not optimised."""
+CONTROLS = (*COVERS, NO_ATTACK)
 WEATHERS = {"sun": "clear", "rain": "rain"}
 """The thesis' and ours."""
 LOCATIONS = {1: "sun-behind-ego", 2: "sun-beside", 3: "sun-behind-sign"}
@@ -220,7 +222,7 @@ def is_of(row: str, identity: Mapping[str, object]) -> bool:
     configuration = CONFIGURATIONS.get(row, CONFIGURATIONS[STANDARD])
     if not math.isclose(float(str(identity["threat_budget"])), configuration.budget):
         return False
-    if row in REFERENCE_PATCHES:
+    if row in COVERS:
         return identity["attack"] == row
     crafted = parameters(identity["attack_params"])
     return identity["attack"] == ATTACK and all(

@@ -45,8 +45,8 @@ def test_a_patch_hides_a_sign_from_yolo_and_fog_alone_does_less(
     assert said.code == 0, said.err
     assert "yolov3_tiny" in said.out
     records = reading.read(tmp_path, track=track("detection"))
-    assert set(records["attack"].to_pylist()) == {"none", "paint", "blank", "noise_patch", "grey_patch"}
-    assert records.num_rows == 5 * 2 * 2
+    assert set(records["attack"].to_pylist()) == {"none", "paint", "blank", "noise_patch", "grey_patch", "plain_patch"}
+    assert records.num_rows == 7 * 2 * 2
     assert mean(records, "none", "clear") > 0.7
     assert mean(records, "none", "clear", "ran") == 0
     assert mean(records, "none", "fog") < mean(records, "none", "clear")

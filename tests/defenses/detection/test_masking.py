@@ -271,6 +271,7 @@ def test_the_certificate_is_a_column_and_a_false_one_ends_the_run() -> None:
     kept = run(Promising(0.3))
     assert kept["certified"] == pytest.approx(0.3 - kept["decoy_confidence"], abs=1e-6)
     assert (kept["certified"] <= kept["stop_score"]).all()
+    assert kept["frame_certified"].tolist() == [pytest.approx([0.3] * len(approach.scenes))]
     assert torch.tensor(run(RedDetector())["certified"]).isnan().all()
     assert torch.tensor(run(Promising(0.3), patch=None, share=0.0)["certified"]).isnan().all()
     assert isinstance(approach.scenes, RedScenes)

@@ -72,6 +72,16 @@ def test_the_gradient_reaches_every_texel() -> None:
     assert (patch.grad > 0).all()
 
 
+def test_a_plate_beside_a_sign_out_of_sight_changes_nothing() -> None:
+    """On five lanes the sign has left the image in the last frames, and the frame holds no light of it."""
+    cell = WORLD.facts.axes.cell(lanes=5, density=2.0, weather="rain")
+    (approach,) = WORLD.approaches(cell, range(1))
+    shown = approach.scenes.mounted(BESIDE)
+    gone = (shown.visible == 0).nonzero().flatten()
+    assert len(gone)
+    assert torch.equal(shown.render(gone, PATCH, SHARE), shown.render(gone, None, SHARE))
+
+
 def test_nothing_is_certain_under_a_patch_that_covers_nothing() -> None:
     assert not BESIDE.covers
     assert Mount().covers

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import binom
 
 from cavbench.statistics.independent import independent
+from tests.leaderboard import simulated_patches
 from tests.leaderboard.simulated_studies import BAD, DESIGNS, EQUAL, STUDIES, called_different, coverage
 
 COUNT, FEWER = 150, 50
@@ -23,6 +24,22 @@ def test_printed_intervals_hold_the_truth(title: str, runs: int) -> None:
     assert len(hits) == 5
     for name, count in hits.items():
         assert LEAST <= count <= MOST, f"{name}: {count} of {COUNT}"
+
+
+@pytest.mark.parametrize(
+    ("title", "design"), [("hardened", "5 x 3"), ("hardened", "5 x 10"), ("places differ most", "5 x 10")]
+)
+def test_printed_intervals_of_detectors_hold_the_truth_for_other_patches_and_places(title: str, design: str) -> None:
+    hits = simulated_patches.coverage(simulated_patches.STUDIES[title], simulated_patches.DESIGNS[design], FEWER)
+    for name in simulated_patches.NAMES:
+        assert hits[name] >= binom.ppf(0.0005, FEWER, 0.94), f"{name}: {hits[name]} of {FEWER}"
+
+
+def test_an_interval_of_many_places_is_not_wider_than_the_spread_of_the_scores() -> None:
+    """With an interval from 0 to 1 the truth is always inside."""
+    study, generator = simulated_patches.STUDIES["hardened"], np.random.default_rng(0)
+    wide = [simulated_patches.row(study, (5, 10), generator).worst.score for _ in range(5)]
+    assert all(one.high - one.low < 4 * (study.patch + study.place) for one in wide)
 
 
 @pytest.mark.parametrize("design", ["1 and 10", "1 and 4", "3 and 10", "1 and 1", "rules and 10"])
