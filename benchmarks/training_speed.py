@@ -1,7 +1,7 @@
 """Measures what compiled updates save in the training of drivers:
 
-    python benchmarks/training_speed.py [--victims dqn] [--rounds 3] [--decisions 64]
-    python benchmarks/training_speed.py --curves 10
+    python benchmarks/training_speed.py [--victims dqn ppo sac] [--rounds 3] [--decisions 64]
+    python benchmarks/training_speed.py [--victims dqn ppo sac] --curves 10
 
 Prints the CPU milliseconds of a decision on all roads, driving and learning apart, in both phases of the training, with torch's
 updates and with compiled ones; and the CPU minutes of a whole training without its checkpoints. Both are measured alternately
@@ -31,7 +31,9 @@ from cavbench.envs.highway.world import HighwayWorld
 from cavbench.run.process import settle
 
 WAYS = {"torch": True, "compiled": False}
-SHORT = {"decisions": 2000, "copies": 4, "batch": 256, "checkpoints": 2, "memory": 100_000}
+SHORT = {"decisions": 2000, "copies": 4, "batch": 256, "checkpoints": 2}
+ROLLOUTS = {"batch": 128, "fine_rollout": 32, "fine_batch": 256, "settling": 1}
+"""A short training has as many rollouts as it can learn from."""
 
 
 def main() -> None:
@@ -58,7 +60,9 @@ def _speed(name: str, rounds: int, decisions: int) -> None:
     minutes = dict.fromkeys(WAYS, 0.0)
     for number, phase in enumerate(victim.phases(TrainingHooks())):
         practices = {way: _practice(victim, number, torchs) for way, torchs in WAYS.items()}
-        found = [{way: _round(practice, decisions) for way, practice in practices.items()} for _ in range(rounds)]
+        # The first round compiles. A round has whole rollouts, if it learns from those.
+        length = max([decisions, *(getattr(each.learner, "rollout", 0) for each in practices.values())])
+        found = [{way: _round(each, length) for way, each in practices.items()} for _ in range(rounds + 1)][1:]
         drive, learn = ({way: statistics.median(one[way][at] for one in found) for way in WAYS} for at in (0, 1))
         ratio = statistics.median(sum(one["torch"]) / sum(one["compiled"]) for one in found)
         for way in WAYS:
@@ -75,7 +79,7 @@ def _speed(name: str, rounds: int, decisions: int) -> None:
 
 
 def _practice(victim: LearningDriver, number: int, torchs: bool) -> Practice:
-    """A phase of the training that has begun to learn."""
+    """A phase of the training with enough experience to learn from."""
     world, hooks = HighwayWorld(), TrainingHooks()
     torch.manual_seed(0)
     phase = victim.phases(hooks)[number]
@@ -86,7 +90,6 @@ def _practice(victim: LearningDriver, number: int, torchs: bool) -> Practice:
     learner.enter(phase)
     practice = Practice(env, learner, phase, crash_penalty=victim.crash_penalty)
     practice.drive(5 * CHUNK, 0.5)
-    learner.learn(1e-4, 0.5)
     return practice
 
 
@@ -103,7 +106,8 @@ def _round(practice: Practice, decisions: int) -> tuple[float, float]:
 
 
 def _curves(name: str, seeds: int) -> None:
-    victim = choose("victim", name, **SHORT).component
+    short = ROLLOUTS if name == "ppo" else {"memory": 100_000}
+    victim = choose("victim", name, **SHORT | short).component
     print(
         f"| {name} | share of the training | mean over {seeds} seeds | standard deviation | of each seed |\n|---|---|---|---|---|"
     )

@@ -210,7 +210,7 @@ def adam(
         number: of this step, from 1.
         rate, eps: learning rate, and what is added to the root of the second moment.
         longest: a longer gradient is shortened to this.
-        average: moves by `tau` of the way to the new weights.
+        average: moves by `tau` of the way to the new weights; empty for none.
     """
     norm = 0.0
     for value in by_weights:
@@ -225,6 +225,7 @@ def adam(
         first[k] += slow * (slope - first[k])
         second[k] = kept * second[k] + fast * slope * slope
         weights[k] -= stride * first[k] / (np.sqrt(second[k]) / root + little)
+    for k in range(len(average)):
         average[k] += share * (weights[k] - average[k])
 
 

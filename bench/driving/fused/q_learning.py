@@ -74,13 +74,13 @@ class QLearning:
 
     def scores(self, observation: Tensor) -> Tensor:
         """Q(s, .) [N, A] of the network in training."""
-        return self.network.forward(observation)
+        return self.network.answers(observation)
 
     def update(self, batch: Transitions, *, gamma: float, gap: float, rate: float) -> None:
         """One gradient step; `gamma` is the discount of a decision, `gap` that of advantage learning."""
         discount = gamma**batch.steps * ~batch.failed
-        after = self.network.forward(batch.after)
-        targets = self.network.forward(batch.after, weights=self.target)
+        after = self.network.answers(batch.after)
+        targets = self.network.answers(batch.after, weights=self.target)
         values = self.network.forward(batch.observation)
         by_values, every = torch.empty_like(values), torch.ones_like(values, dtype=torch.bool)
         learning.errors(

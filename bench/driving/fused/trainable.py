@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -9,6 +11,9 @@ from torch import Tensor
 from cavbench.driving.fused import kernels, learning
 from cavbench.driving.fused.kernels import Floats
 from cavbench.driving.fused.network import Fused
+
+Room = tuple[Floats, Floats, Floats]
+NO_AVERAGE: Floats = np.empty(0, np.float32)
 
 
 class Trainable:
@@ -23,31 +28,44 @@ class Trainable:
     """
 
     def __init__(self, fused: Fused, *, eps: float = 1e-8) -> None:
-        self.fused, self.eps, self.steps = fused, eps, 0
+        self.fused, self.eps = fused, eps
         self.weights: Floats = fused.gathered().numpy()
         self.by_weights = np.zeros_like(self.weights)
+        self.restart()
+        self._room = self._rooms(1)
+
+    def restart(self) -> None:
+        """Forget the moments of Adam."""
+        self.steps = 0
         self.first, self.second = np.zeros((2, len(self.weights)), np.float32)
-        self._kept: Floats = np.empty((0, fused.kept, kernels.LANES), np.float32)
+
+    def answers(self, observation: Tensor, *, weights: Floats | None = None) -> Tensor:
+        """The answers [N, A] about observations [N, V, F], by default with its own weights."""
+        return self._answers(observation, weights, self._rooms(1))[0]
 
     def forward(self, observation: Tensor, *, weights: Floats | None = None) -> Tensor:
-        """The answers [N, A] about observations [N, V, F], by default with its own weights; `backward` is about this call."""
+        """As `answers`; `backward` is about this call."""
+        blocks = -(-len(observation) // kernels.LANES)
+        if len(self._room[0]) < blocks:
+            self._room = self._rooms(blocks)
+        out, self._pass = self._answers(observation, weights, self._room)
+        return out
+
+    def _answers(self, observation: Tensor, weights: Floats | None, room: Room) -> tuple[Tensor, tuple[Any, ...]]:
+        """The answers, and what the gradient needs besides them."""
         points = observation.reshape(len(observation), -1).contiguous().numpy()
-        blocks = -(-len(points) // kernels.LANES)
-        if len(self._kept) < blocks:
-            self._kept = np.empty((blocks, self.fused.kept, kernels.LANES), np.float32)
-            self._best, self._chosen = np.empty((2, blocks, self.fused.pooled, kernels.LANES), np.float32)
-        out = np.empty((len(points), self.fused.outputs), np.float32)
         network = self.fused.form(points.shape[1]), self.fused.widths, self.fused.kinds
-        self._pass = points, self.weights if weights is None else weights, *network, *self._room(blocks)
-        kernels.forward(*self._pass[:5], out, *self._pass[5:])
-        return torch.from_numpy(out)
+        given = points, self.weights if weights is None else weights, *network
+        out = np.empty((len(points), self.fused.outputs), np.float32)
+        kernels.forward(*given, out, *room)
+        return torch.from_numpy(out), (*given, *room)
 
     def backward(self, by_answers: Tensor) -> None:
         """Sets the gradient in the weights, from that in the answers [N, A] of the last `forward`."""
         learning.gradient(*self._pass, by_answers.contiguous().numpy(), self.by_weights)
 
-    def step(self, rate: float, *, longest: float, average: Floats, tau: float) -> None:
-        """Take a step of Adam, and move the running average of the weights.
+    def step(self, rate: float, *, longest: float, average: Floats = NO_AVERAGE, tau: float = 0.0) -> None:
+        """Take a step of Adam, and move a running average of the weights, if there is one.
 
         Args:
             rate: learning rate.
@@ -59,5 +77,7 @@ class Trainable:
         moments = self.first, self.second, self.steps
         learning.adam(self.weights, self.by_weights, *moments, rate, self.eps, longest, average, tau)
 
-    def _room(self, blocks: int) -> tuple[Floats, Floats, Floats]:
-        return self._kept[:blocks], self._best[:blocks], self._chosen[:blocks]
+    def _rooms(self, blocks: int) -> Room:
+        """Room for what `kernels.forward` keeps of so many blocks; a single one is used for all."""
+        best, chosen = np.empty((2, blocks, self.fused.pooled, kernels.LANES), np.float32)
+        return np.empty((blocks, self.fused.kept, kernels.LANES), np.float32), best, chosen

@@ -19,7 +19,7 @@ from cavbench.driving.fused.q_learning import Greedy, QLearning, Transitions
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.networks import QPolicy
 from cavbench.driving.victims.practice import ALLOWED
-from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
+from cavbench.driving.victims.replay import Compiled, OffPolicyDriver, OffPolicyLearner
 
 LONGEST = 10.0
 """The norm to which gradients are clipped."""
@@ -79,12 +79,6 @@ class _QLearner(OffPolicyLearner):
             self.greedy.eps_end.fill_(self.recipe.final_epsilon * phase.exploration)
             self.greedy.eps.fill_(self.recipe.final_epsilon * phase.exploration)
 
-    def learn(self, learning_rate: float, share: float) -> None:
-        if isinstance(self.rule, _Compiled):
-            self.rule.learn(self.buffer[:], self.batch, CHUNK * self.updates, learning_rate)
-        else:
-            super().learn(learning_rate, share)
-
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
         self.rule.update(sample, learning_rate)
 
@@ -96,26 +90,18 @@ class _QLearner(OffPolicyLearner):
         return self.mean
 
 
-class _Compiled:
-    """The same algorithm as `_Torch` in compiled calls (`cavbench.driving.fused`), equal to rounding."""
+class _Compiled(Compiled):
+    """The same algorithm as `_Torch` in compiled calls, equal to rounding."""
 
     def __init__(self, learner: _QLearner) -> None:
+        super().__init__(learner.mask)
         self.learning = QLearning(learner.policy.network.fused, tau=learner.recipe.tau, longest=LONGEST)
-        self.actor, self.mask = Greedy(self.learning, learner.mask), learner.mask
+        self.actor = Greedy(self.learning, learner.mask)
 
     def enter(self, phase: Phase) -> None:
         self.gamma, self.gap = phase.gamma, phase.gap
 
-    def learn(self, stored: TensorDictBase, batch: int, updates: int, rate: float) -> None:
-        """Make several updates on random batches of what is `stored`."""
-        transitions = Transitions.of(stored, self.mask)
-        for rows in torch.randint(len(transitions), (updates, batch)):
-            self._update(transitions[rows], rate)
-
-    def update(self, sample: TensorDictBase, rate: float) -> None:
-        self._update(Transitions.of(sample, self.mask), rate)
-
-    def _update(self, batch: Transitions, rate: float) -> None:
+    def descend(self, batch: Transitions, rate: float) -> None:
         self.learning.update(batch, gamma=self.gamma, gap=self.gap, rate=rate)
 
     def average(self, policy: QPolicy) -> None:

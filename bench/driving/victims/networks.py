@@ -62,6 +62,7 @@ class StateValue(nn.Module):
         super().__init__()
         self.encoder = Encoder(features)
         self.head = _head(self.encoder.out_features, 1, hidden)
+        self.fused = Fused(_layers(self.head), encoder=self.encoder.layers)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.head(self.encoder(observation))

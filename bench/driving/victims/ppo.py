@@ -17,6 +17,8 @@ from torchrl.objectives.value import GAE
 
 from cavbench.core.ranges import Count, Natural, NotNegative, Positive, Share
 from cavbench.driving import ActionType, Policy, TrainingHooks
+from cavbench.driving.fused.categorical import Drawing
+from cavbench.driving.fused.proximal import Proximal
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.logits import Logits
 from cavbench.driving.victims.networks import QPolicy, StateValue
@@ -105,6 +107,8 @@ BEHIND = 0.5
 
 
 class _ProximalLearner(Learner):
+    """Drives, and remembers a rollout; how it learns is `_Compiled`, or `_Torch` if the hooks change what is learned."""
+
     def __init__(self, recipe: PPO, env: EnvBase, hooks: TrainingHooks) -> None:
         super().__init__(hooks)
         self.recipe = recipe
@@ -118,37 +122,12 @@ class _ProximalLearner(Learner):
         else:
             with torch.no_grad():
                 self.policy.network.head[-1].weight.mul_(0.1)
-        read = ["observation", ALLOWED] if recipe.behind else ["observation"]
-        actor = ProbabilisticTensorDictSequential(
-            TensorDictModule(Logits(self.policy.network), in_keys=read, out_keys=["logits"]),
-            ProbabilisticTensorDictModule(
-                in_keys=["logits"],
-                out_keys=["action"],
-                distribution_class=torch.distributions.Categorical,
-                distribution_kwargs={"validate_args": False},
-                return_log_prob=True,
-                log_prob_key="action_log_prob",
-            ),
-        )
-        self.explore = actor
-        self.critic = TensorDictModule(
-            StateValue(features, recipe.hidden), in_keys=["observation"], out_keys=["state_value"]
-        )
-        self.loss = ClipPPOLoss(
-            actor,
-            self.critic,
-            clip_epsilon=recipe.clip,
-            entropy_coeff=recipe.entropy,
-            critic_coeff=1.0,
-            reduction="none",
-        )
+        self.mask = ALLOWED if recipe.behind else None
+        self.critic = StateValue(features, recipe.hidden)
         self.mean: QPolicy = copy.deepcopy(self.policy)
+        self.rule: _Compiled | _Torch = (_Torch if hooks.learns_otherwise else _Compiled)(self)
+        self.explore = self.rule.actor
         self.fine, self.settling = False, 0
-        self._start()
-
-    def _start(self) -> None:
-        parts = [{"params": list(part.parameters())} for part in (self.policy, self.critic)]
-        self.adam = torch.optim.Adam(parts, self.recipe.learning_rate, eps=1e-5)
 
     def enter(self, phase: Phase) -> None:
         recipe = self.recipe
@@ -158,9 +137,9 @@ class _ProximalLearner(Learner):
         if self.fine:
             self.rollout, self.epochs, self.batch = recipe.fine_rollout, recipe.fine_epochs, recipe.fine_batch
             self.explored, self.settling, self.final = 1.0, recipe.settling, self.final * phase.exploration
-            self._start()
+            self.rule.restart()
         trace = (recipe.fine_trace if self.fine else recipe.trace) ** (phase.repeat / recipe.repeat)
-        self.advantage = GAE(gamma=phase.gamma, lmbda=trace, value_network=self.critic)
+        self.rule.enter(phase.gamma, trace)
         self.chunks = []
 
     def progress(self, info: TensorDictBase) -> Tensor:
@@ -181,40 +160,132 @@ class _ProximalLearner(Learner):
             return
         if not self.fine:
             self.explored = min(1.0, self.first + (1 - self.first) * share / recipe.explore_until)
-        self.loss.entropy_coeff.fill_(recipe.entropy * (self.final / recipe.entropy) ** self.explored)
+        self.rule.weigh(recipe.entropy * (self.final / recipe.entropy) ** self.explored)
         whole, self.chunks = torch.cat(self.chunks, -1), []
-        with torch.no_grad():
-            flat = self.advantage(whole).exclude("next").reshape(-1)
+        flat = self.rule.judged(whole)
         advantage = flat["advantage"]
         flat.set("advantage", (advantage - advantage.mean()) / advantage.std().clamp_min(1e-6))
-        flat.set("truth", flat["observation"])
         for _ in range(self.epochs):
             for rows in torch.randperm(len(flat)).split(self.batch):
                 self.update(flat[rows], rate)
         self.settling -= 1
 
     def update(self, sample: TensorDictBase, learning_rate: float) -> None:
-        policy, critic = self.adam.param_groups
-        policy["lr"] = critic["lr"] = learning_rate
+        rates = learning_rate, learning_rate
         if self.fine:
-            share = self.recipe.fine_rate / self.recipe.learning_rate
-            policy["lr"] = learning_rate * share if self.settling <= 0 else 0.0
-            critic["lr"] = learning_rate * share * self.recipe.critic_speed
-        self.adam.zero_grad()
-        self.hooks.loss(self.policy, sample, self._surrogate).mean().backward()
-        for network in (self.policy, self.critic):
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 0.5)
-        self.adam.step()
-        for mean, own in zip(self.mean.parameters(), self.policy.parameters(), strict=True):
-            mean.data.lerp_(own.data, self.recipe.tau)
-
-    def _surrogate(self, sample: TensorDictBase) -> Tensor:
-        parts = self.loss(sample)
-        loss: Tensor = parts["loss_objective"] + parts["loss_critic"] + parts["loss_entropy"]
-        return loss.flatten()
+            fine = learning_rate * (self.recipe.fine_rate / self.recipe.learning_rate)
+            rates = fine if self.settling <= 0 else 0.0, fine * self.recipe.critic_speed
+        self.rule.update(sample, rates)
 
     def anneal(self) -> None:
         """Nothing: its exploration is its own uncertainty."""
 
     def averaged(self) -> Policy:
+        return self.rule.averaged()
+
+
+LONGEST, EPS = 0.5, 1e-5
+"""The norm to which gradients are clipped, and what Adam adds to the root of its second moment."""
+
+
+class _Compiled:
+    """The same algorithm as `_Torch` in compiled calls (`cavbench.driving.fused`), equal to rounding."""
+
+    def __init__(self, learner: _ProximalLearner) -> None:
+        self.mean, self.mask, recipe = learner.mean, learner.mask, learner.recipe
+        networks = learner.policy.network.fused, learner.critic.fused
+        self.learning = Proximal(*networks, clip=recipe.clip, tau=recipe.tau, longest=LONGEST, eps=EPS)
+        self.actor = Drawing(self.learning.actor, self.mask, log_prob="action_log_prob")
+        self.entropy = recipe.entropy
+
+    def restart(self) -> None:
+        self.learning.restart()
+
+    def enter(self, gamma: float, trace: float) -> None:
+        self.gamma, self.trace = gamma, trace
+
+    def weigh(self, entropy: float) -> None:
+        self.entropy = entropy
+
+    def judged(self, whole: TensorDictBase) -> TensorDictBase:
+        advantage, target = self.learning.judged(whole, gamma=self.gamma, trace=self.trace)
+        flat = whole.exclude("next").set("advantage", advantage.unsqueeze(-1))
+        return flat.set("value_target", target.unsqueeze(-1)).reshape(-1)
+
+    def update(self, sample: TensorDictBase, rates: tuple[float, float]) -> None:
+        allowed = None if self.mask is None else sample[self.mask]
+        self.learning.update(sample, allowed, self.entropy, rates)
+
+    def averaged(self) -> QPolicy:
+        self.mean.network.fused.assign(torch.from_numpy(self.learning.mean))
         return copy.deepcopy(self.mean)
+
+
+class _Torch:
+    """TorchRL's loss and advantages, torch's Adam."""
+
+    def __init__(self, learner: _ProximalLearner) -> None:
+        self.policy, self.mean, self.hooks, recipe = learner.policy, learner.mean, learner.hooks, learner.recipe
+        self.rate, self.tau = recipe.learning_rate, recipe.tau
+        read = ["observation"] if learner.mask is None else ["observation", learner.mask]
+        self.actor = ProbabilisticTensorDictSequential(
+            TensorDictModule(Logits(self.policy.network), in_keys=read, out_keys=["logits"]),
+            ProbabilisticTensorDictModule(
+                in_keys=["logits"],
+                out_keys=["action"],
+                distribution_class=torch.distributions.Categorical,
+                distribution_kwargs={"validate_args": False},
+                return_log_prob=True,
+                log_prob_key="action_log_prob",
+            ),
+        )
+        self.critic = TensorDictModule(learner.critic, in_keys=["observation"], out_keys=["state_value"])
+        self.loss = ClipPPOLoss(
+            self.actor,
+            self.critic,
+            clip_epsilon=recipe.clip,
+            entropy_coeff=recipe.entropy,
+            critic_coeff=1.0,
+            reduction="none",
+        )
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the moments of Adam."""
+        parts = [{"params": list(part.parameters())} for part in (self.policy, self.critic)]
+        self.adam = torch.optim.Adam(parts, self.rate, eps=EPS)
+
+    def enter(self, gamma: float, trace: float) -> None:
+        """Set the discount of a decision and lambda."""
+        self.advantage = GAE(gamma=gamma, lmbda=trace, value_network=self.critic)
+
+    def weigh(self, entropy: float) -> None:
+        """Set the weight of the entropy bonus."""
+        self.loss.entropy_coeff.fill_(entropy)
+
+    @torch.no_grad()
+    def judged(self, whole: TensorDictBase) -> TensorDictBase:
+        """Decisions [B, T] in one row [N], with their `advantage` and `value_target` [N, 1]."""
+        flat = self.advantage(whole).exclude("next").reshape(-1)
+        return flat.set("truth", flat["observation"])
+
+    def update(self, sample: TensorDictBase, rates: tuple[float, float]) -> None:
+        """One gradient step; `rates` are those of the policy and the critic."""
+        for group, rate in zip(self.adam.param_groups, rates, strict=True):
+            group["lr"] = rate
+        self.adam.zero_grad()
+        self.hooks.loss(self.policy, sample, self._surrogate).mean().backward()
+        for network in (self.policy, self.critic):
+            torch.nn.utils.clip_grad_norm_(network.parameters(), LONGEST)
+        self.adam.step()
+        for mean, own in zip(self.mean.parameters(), self.policy.parameters(), strict=True):
+            mean.data.lerp_(own.data, self.tau)
+
+    def averaged(self) -> QPolicy:
+        """A copy of the averaged policy."""
+        return copy.deepcopy(self.mean)
+
+    def _surrogate(self, sample: TensorDictBase) -> Tensor:
+        parts = self.loss(sample)
+        loss: Tensor = parts["loss_objective"] + parts["loss_critic"] + parts["loss_entropy"]
+        return loss.flatten()

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
+from typing import Any
 
+import torch
 from tensordict import TensorDictBase
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import MultiStepTransform
 
 from cavbench.core.ranges import Count, Share
 from cavbench.driving import TrainingHooks
+from cavbench.driving.fused.q_learning import Transitions
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
 from cavbench.driving.victims.training import LearningDriver
 
@@ -37,6 +41,30 @@ class OffPolicyDriver(LearningDriver):
         return [*(replace(phase, n_step=self.n_step) for phase in coarse), replace(fine, n_step=span)]
 
 
+class Compiled(ABC):
+    """How a learner learns in compiled calls (`cavbench.driving.fused`).
+
+    Args:
+        mask: key of the actions that a defence leaves; None for all.
+    """
+
+    def __init__(self, mask: str | None) -> None:
+        self.mask = mask
+
+    def learn(self, stored: TensorDictBase, batch: int, updates: int, rate: float) -> None:
+        """Make several updates on random batches of what is `stored`."""
+        transitions = Transitions.of(stored, self.mask)
+        for rows in torch.randint(len(transitions), (updates, batch)):
+            self.descend(transitions[rows], rate)
+
+    def update(self, sample: TensorDictBase, rate: float) -> None:
+        self.descend(Transitions.of(sample, self.mask), rate)
+
+    @abstractmethod
+    def descend(self, batch: Transitions, rate: float) -> None:
+        """One gradient step on a batch of transitions."""
+
+
 class OffPolicyLearner(Learner):
     """An algorithm that learns from batches of a replay buffer, which is empty when a phase begins.
 
@@ -46,6 +74,9 @@ class OffPolicyLearner(Learner):
         batch: transitions per update.
         updates: gradient updates per decision.
     """
+
+    rule: Any = None
+    """How it learns, if it has several ways. A `Compiled` one draws its batches itself."""
 
     def __init__(self, hooks: TrainingHooks, *, memory: int, batch: int, updates: int) -> None:
         super().__init__(hooks)
@@ -62,6 +93,9 @@ class OffPolicyLearner(Learner):
             self.buffer.extend(transitions.exclude("gamma", "nonterminal", ("next", "original_reward")).reshape(-1))
 
     def learn(self, learning_rate: float, share: float) -> None:
+        if isinstance(self.rule, Compiled):
+            self.rule.learn(self.buffer[:], self.batch, CHUNK * self.updates, learning_rate)
+            return
         for _ in range(CHUNK * self.updates):
             self.update(self.sample(share), learning_rate)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from dataclasses import dataclass
 from typing import Annotated, Any
@@ -23,10 +24,13 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate, ValueEstimators
 
 from cavbench.core.ranges import Count, Positive, Share
 from cavbench.driving import ActionType, Policy, TrainingHooks
+from cavbench.driving.fused.categorical import Drawing
+from cavbench.driving.fused.q_learning import Transitions
+from cavbench.driving.fused.soft import SoftActorCritic
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.logits import Logits, SoftPolicy
 from cavbench.driving.victims.practice import ALLOWED
-from cavbench.driving.victims.replay import OffPolicyDriver, OffPolicyLearner
+from cavbench.driving.victims.replay import Compiled, OffPolicyDriver, OffPolicyLearner
 
 EntropyShare = Annotated[float, Interval(gt=0, lt=1)]
 
@@ -80,6 +84,8 @@ class _AveragedSACLoss(DiscreteSACLoss):
 
 
 class _SoftLearner(OffPolicyLearner):
+    """Drives, and remembers; how it learns is `_Compiled`, or `_Torch` if the hooks change what is learned."""
+
     def __init__(self, recipe: SAC, env: EnvBase, hooks: TrainingHooks) -> None:
         super().__init__(hooks, memory=recipe.memory, batch=recipe.batch, updates=recipe.updates)
         self.recipe, self.decisions = recipe, 0
@@ -92,7 +98,6 @@ class _SoftLearner(OffPolicyLearner):
             self.policy.load_state_dict(hooks.start.state_dict())
         self.mask = ALLOWED if recipe.behind else None
         self.largest_entropy = math.log(actions)
-        actor = self._actor(self.policy)
         self.uniform = EGreedyModule(
             Categorical(actions, shape=(batch,)),
             eps_init=1.0 if hooks.start is None else recipe.final_epsilon,
@@ -100,12 +105,93 @@ class _SoftLearner(OffPolicyLearner):
             annealing_num_steps=math.ceil(0.3 * recipe.decisions / CHUNK),
             action_mask_key=self.mask,
         )
-        self.explore = TensorDictSequential(actor, self.uniform)
+        self.rule: _Compiled | _Torch = (_Torch if hooks.learns_otherwise else _Compiled)(self)
+        # What is trained are twins, which start with the policy's critics; the policy's are copies of them.
+        self.policy.critics.requires_grad_(False)
+        self.explore = TensorDictSequential(self.rule.actor, self.uniform)
+
+    def enter(self, phase: Phase) -> None:
+        super().enter(phase)
+        self.rule.enter(phase)
+        self.rule.aim(self._entropy())
+        if phase.exploration < 1:
+            self.uniform.eps_end.fill_(self.recipe.final_epsilon * phase.exploration)
+            self.uniform.eps.fill_(self.recipe.final_epsilon * phase.exploration)
+
+    def update(self, sample: TensorDictBase, learning_rate: float) -> None:
+        self.rule.update(sample, learning_rate)
+
+    @torch.no_grad()
+    def anneal(self) -> None:
+        self.decisions += CHUNK
+        self.uniform.step()
+        self.rule.aim(self._entropy())
+        self.rule.inform()
+
+    def _entropy(self) -> float:
+        """The target entropy."""
+        recipe = self.recipe
+        done = self.decisions / (recipe.explore_until * recipe.decisions) if self.hooks.start is None else 1.0
+        share = recipe.entropy * (recipe.final_entropy / recipe.entropy) ** min(1.0, done)
+        return share * self.largest_entropy
+
+    def averaged(self) -> Policy:
+        self.rule.average(self.mean)
+        self.mean.temperature.copy_(self.policy.temperature)
+        return self.mean
+
+
+LONGEST = 10.0
+"""The norm to which the gradients of the actor and of the critics are clipped."""
+
+
+class _Compiled(Compiled):
+    """The same algorithm as `_Torch` in compiled calls, equal to rounding."""
+
+    def __init__(self, learner: _SoftLearner) -> None:
+        super().__init__(learner.mask)
+        recipe, self.policy = learner.recipe, learner.policy
+        twins = copy.deepcopy(self.policy.critics)
+        self.learning = SoftActorCritic(
+            self.policy.network.fused,
+            [twin.fused for twin in twins],
+            [critic.fused for critic in self.policy.critics],
+            temperature=float(self.policy.temperature),
+            least=recipe.least_temperature,
+            heating=recipe.temperature_rate,
+            tau=recipe.tau,
+            longest=LONGEST,
+        )
+        self.actor = Drawing(self.learning.actor, self.mask)
+
+    def enter(self, phase: Phase) -> None:
+        self.gamma, self.gap = phase.gamma, phase.gap
+
+    def aim(self, entropy: float) -> None:
+        self.entropy = entropy
+
+    def descend(self, batch: Transitions, rate: float) -> None:
+        self.learning.update(batch, gamma=self.gamma, gap=self.gap, entropy=self.entropy, rate=rate)
+
+    def inform(self) -> None:
+        self.learning.inform()
+        self.policy.temperature.fill_(self.learning.temperature)
+
+    def average(self, policy: SoftPolicy) -> None:
+        self.learning.averaged(policy.network.fused, [critic.fused for critic in policy.critics])
+
+
+class _Torch:
+    """TorchRL's loss, torch's Adam."""
+
+    def __init__(self, learner: _SoftLearner) -> None:
+        self.policy, self.hooks, self.mask, recipe = learner.policy, learner.hooks, learner.mask, learner.recipe
+        self.actor = self._actor(self.policy)
         self.loss = _AveragedSACLoss(
-            actor,
+            self.actor,
             _critic(self.policy.critics[0]),
             action_space="categorical",
-            num_actions=actions,
+            num_actions=self.policy.shape["actions"],
             num_qvalue_nets=recipe.critics,
             alpha_init=float(self.policy.temperature),
             min_alpha=recipe.least_temperature,
@@ -113,8 +199,6 @@ class _SoftLearner(OffPolicyLearner):
             reduction="none",
             scalar_output_mode="exclude",
         )
-        # The loss trains its own twin critics, which start with the policy's; the policy's are copies of them.
-        self.policy.critics.requires_grad_(False)
         twins = torch.stack([TensorDict.from_module(_critic(critic)).data for critic in self.policy.critics])
         self.loss.qvalue_network_params.data.update_(twins)
         self.target = SoftUpdate(self.loss, tau=recipe.tau)
@@ -126,15 +210,14 @@ class _SoftLearner(OffPolicyLearner):
         self.adam = torch.optim.Adam(groups)
 
     def enter(self, phase: Phase) -> None:
-        super().enter(phase)
         self.loss.make_value_estimator(ValueEstimators.TD0, gamma=phase.gamma)
         self.gap = phase.gap
-        self._aim()
-        if phase.exploration < 1:
-            self.uniform.eps_end.fill_(self.recipe.final_epsilon * phase.exploration)
-            self.uniform.eps.fill_(self.recipe.final_epsilon * phase.exploration)
 
-    def update(self, sample: TensorDictBase, learning_rate: float) -> None:
+    def aim(self, entropy: float) -> None:
+        """Set the target entropy."""
+        self.loss.target_entropy.fill_(entropy)
+
+    def update(self, sample: TensorDictBase, rate: float) -> None:
         true = sample.copy().set("observation", sample["truth"])
         if self.gap > 0:
             true["next", "reward"] -= self.gap * self._disadvantage(true)
@@ -144,10 +227,22 @@ class _SoftLearner(OffPolicyLearner):
         self.adam.zero_grad()
         loss.backward()
         for group in self.adam.param_groups[:2]:
-            group["lr"] = learning_rate
-            torch.nn.utils.clip_grad_norm_(group["params"], 10.0)
+            group["lr"] = rate
+            torch.nn.utils.clip_grad_norm_(group["params"], LONGEST)
         self.adam.step()
         self.target.step()
+
+    def inform(self) -> None:
+        """Give the policy the critics and the temperature of the training."""
+        self.policy.temperature.copy_(self.loss.log_alpha.exp())
+        for number, critic in enumerate(self.policy.critics):
+            copy_weights(self.loss.qvalue_network_params[number], _critic(critic))
+
+    def average(self, policy: SoftPolicy) -> None:
+        """Copy the averaged weights into another policy."""
+        copy_weights(self.loss.target_actor_network_params, self._actor(policy))
+        for number, critic in enumerate(policy.critics):
+            copy_weights(self.loss.target_qvalue_network_params[number], _critic(critic))
 
     def _actor_loss(self, sample: TensorDictBase) -> Tensor:
         loss, found = self.loss.actor_loss(sample)
@@ -161,29 +256,6 @@ class _SoftLearner(OffPolicyLearner):
         if self.mask is not None:
             values = values.masked_fill(~sample[self.mask], -torch.inf)
         return values.amax(-1, keepdim=True) - values.gather(-1, sample["action"].unsqueeze(-1))
-
-    @torch.no_grad()
-    def anneal(self) -> None:
-        self.decisions += CHUNK
-        self.uniform.step()
-        self._aim()
-        self.policy.temperature.copy_(self.loss.log_alpha.exp())
-        for number, critic in enumerate(self.policy.critics):
-            copy_weights(self.loss.qvalue_network_params[number], _critic(critic))
-
-    def _aim(self) -> None:
-        """Set the target entropy."""
-        recipe = self.recipe
-        done = self.decisions / (recipe.explore_until * recipe.decisions) if self.hooks.start is None else 1.0
-        share = recipe.entropy * (recipe.final_entropy / recipe.entropy) ** min(1.0, done)
-        self.loss.target_entropy.fill_(share * self.largest_entropy)
-
-    def averaged(self) -> Policy:
-        copy_weights(self.loss.target_actor_network_params, self._actor(self.mean))
-        for number, critic in enumerate(self.mean.critics):
-            copy_weights(self.loss.target_qvalue_network_params[number], _critic(critic))
-        self.mean.temperature.copy_(self.policy.temperature)
-        return self.mean
 
     def _actor(self, policy: SoftPolicy) -> ProbabilisticTensorDictSequential:
         read = ["observation"] if self.mask is None else ["observation", self.mask]

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import copy
 from typing import Any
-from unittest.mock import patch
 
 import pytest
 import torch
 from torch import Tensor
 
-from cavbench.core import registry
 from cavbench.driving import TrainingHooks
 from cavbench.driving.fused.trainable import Trainable
 from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.networks import Actor, QNetwork
-from cavbench.driving.victims.practice import ALLOWED, Practice, roads
+from cavbench.driving.victims.practice import ALLOWED, Practice
+from tests.driving.fused.both import both, learner, only
 from tests.driving.victims.test_networks import observation
 
 NETWORKS = {
@@ -93,38 +92,13 @@ def test_steps_are_those_of_torchs_adam_and_soft_update(longest: float) -> None:
         torch.testing.assert_close(own, torchs_own, atol=2e-6, rtol=1e-5)
 
 
-def learner(recipe: DQN, phase: int, *, compiled: bool, start: Any = None) -> tuple[Any, Any, Any]:
-    """A learner that is in a phase, its environment and the phase."""
-    world = registry.load("world", "highway")()
-    hooks = TrainingHooks()
-    hooks.start, hooks.decisions = start, 160
-    torch.manual_seed(0)
-    with patch.object(TrainingHooks, "learns_otherwise", not compiled):
-        phases = recipe.phases(hooks)
-        env = world.make(roads(world, 1), action_type="discrete", action_repeat=phases[phase].repeat)
-        env.set_seed(0)
-        found = recipe.learner(env, hooks)
-    found.enter(phases[phase])
-    return found, env, phases[phase]
-
-
 @pytest.mark.parametrize(("phase", "behind"), [(0, ""), (1, ""), (1, "shield")])
 def test_a_dqn_learns_what_it_learns_with_torch(phase: int, behind: str) -> None:
     recipe = DQN(decisions=400, copies=1, hidden=32, batch=64, memory=5000, tau=0.1, behind=behind)
-    (compiled, _, _), (torchs, env, entered) = (learner(recipe, phase, compiled=each) for each in (True, False))
+    compiled, torchs, env, entered = both(recipe, phase)
     practice = Practice(env, torchs, entered, crash_penalty=40.0)
     if behind:
-        # What a defence would leave: never the first action.
-        everywhere = torch.tensor([False, True, True, True, True]).expand(len(practice.td), 5)
-        step = practice.env.step_and_maybe_reset
-        practice.td[ALLOWED] = everywhere
-
-        def allowed(tensordict: Any) -> Any:
-            now, after = step(tensordict)
-            now["next", ALLOWED] = after[ALLOWED] = everywhere
-            return now, after
-
-        practice.env.step_and_maybe_reset = allowed
+        only(practice, torch.tensor([False, True, True, True, True]))
     practice.drive(60, 0.0)
     for _ in range(40):
         sample = torchs.buffer.sample()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from unittest.mock import patch
 
 import pytest
 import torch
@@ -27,6 +28,7 @@ def soft_lesson(**params: object) -> tuple[SAC, Lesson]:
     victim = SAC(**REPLAYED | params)
     lesson = Lesson(victim, registry.load("world", "highway")())
     sample = lesson.sample
+    sample["steps_to_next_obs"] = torch.ones(64, 1, dtype=torch.int64)
     sample["next", "reward"] = (sample["action"] == 2).float().unsqueeze(-1)
     sample["next", "terminated"] = sample["next", "done"] = torch.ones(64, 1, dtype=torch.bool)
     return victim, lesson
@@ -51,7 +53,7 @@ def test_the_target_entropy_falls_to_its_end() -> None:
     shares = []
     for _ in range(victim.decisions // CHUNK):
         learner.anneal()
-        shares.append(float(learner.loss.target_entropy) / math.log(5))
+        shares.append(learner.rule.entropy / math.log(5))
     assert shares[4] == pytest.approx(0.8 * (0.1 / 0.8) ** 0.5, rel=1e-4)
     assert shares[9:] == pytest.approx([0.1] * 11, rel=1e-4)
 
@@ -59,12 +61,13 @@ def test_the_target_entropy_falls_to_its_end() -> None:
 def test_actions_that_are_not_allowed_have_no_part_in_the_soft_values() -> None:
     """The value of the next state is that of the only action that is left."""
     victim, lesson = soft_lesson(behind="tracker+shield", temperature=1.0)
-    learner = victim.learner(lesson.env, TrainingHooks())
+    with patch.object(TrainingHooks, "learns_otherwise", True):
+        learner = victim.learner(lesson.env, TrainingHooks())
     learner.enter(victim.phases(TrainingHooks())[0])
     sample, only = lesson.sample.clone(), torch.nn.functional.one_hot(torch.arange(64) % 5, 5).bool()
     sample["next", "terminated"] = sample["next", "done"] = torch.zeros(64, 1, dtype=torch.bool)
     sample["next", ALLOWED] = only
-    target = learner.loss._compute_target(sample)
+    target = learner.rule.loss._compute_target(sample)
     values = learner.policy.values(sample["next", "observation"])[only]
     torch.testing.assert_close(target, sample["next", "reward"].squeeze(-1) + victim.gamma * values)
 
