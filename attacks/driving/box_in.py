@@ -64,8 +64,7 @@ class BoxIn(DrivingAttack):
         ego, lane = view.of_car(torch.zeros_like(cars[:, 0])), lane_centre(view.y[:, 0])
         given = Orders.none(view)
         for role, (side, ahead) in enumerate(PLACES[: cars.shape[1]]):
-            car = view.of_car(cars[:, role])
-            lost = (car.x.abs() > REACH) | (car.crashed > 0)
+            lost = view.of_car(cars[:, role]).x.abs() > REACH
             cars[:, role] = torch.where(lost, 0, cars[:, role])
             cars[:, role] = torch.where(cars[:, role] > 0, cars[:, role], self._nearest(view, lane + side, ahead, cars))
             car = view.of_car(cars[:, role])

@@ -71,6 +71,10 @@ class Rival(Lessons, DrivingAttack):
 
     trained_in: str = ""
 
+    @property
+    def forges(self) -> tuple[str, ...]:
+        return (f"traffic.cars={self.cars}",)
+
     def zoo_name(self, victim: DrivingVictim) -> str:
         return "rival"
 

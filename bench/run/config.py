@@ -50,7 +50,7 @@ class TrainConfig:
         check_track(self.victim, self.defense, self.attack, self.world)
         # A pair checks that the attack fits the victim. What the attack needs is allowed where it is trained.
         model, attack = self.victim.component.threat, self.attack.component
-        threat = model(**sets.read(model, list(attack.forges) if attack.learns else []))
+        threat = model(**sets.read(model, list(attack.forges)))
         Pair(attack=self.attack, defense=self.defense, victim=self.victim, world=self.world, threat=threat)
 
     @property

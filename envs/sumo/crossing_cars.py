@@ -40,7 +40,8 @@ def start(row: int, seed: int, cell: Cell, vehicles: int, ego: Model) -> NDArray
     found = []
     for side in FIRST:
         for lane in range(cell.lanes if side in ("west", "east") else 1):
-            steps = spacing * draws.uniform(1 - SPREAD, 1 + SPREAD, int(LENGTH / spacing / (1 - SPREAD)))
+            most = max(1, int(LENGTH / spacing / (1 - SPREAD)))
+            steps = spacing * draws.uniform(1 - SPREAD, 1 + SPREAD, most)
             places = FIRST[side] + draws.uniform(0, spacing) + np.cumsum(steps) - steps[0]
             # Nobody starts behind the ego.
             last = before - BEHIND_NOBODY - VEHICLE_LENGTH if side == "west" else LENGTH - 2 * VEHICLE_LENGTH

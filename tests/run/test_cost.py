@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import random
+import runpy
+import subprocess
+import sys
+import time
 from io import StringIO
 from pathlib import Path
 
@@ -19,6 +23,7 @@ from cavbench.run.progress import RunProgress
 from cavbench.run.task import Task
 from cavbench.terminal import Console
 from tests.command import Bench
+from tests.tree import ROOT
 
 pytestmark = pytest.mark.usefixtures("toy_folder")
 SHORT = ("lanes=3,4", "density=1", "weather=clear", "episodes=2", "seeds=0,1")
@@ -77,6 +82,15 @@ def test_the_table_names_components_that_exist() -> None:
         for row, attacks in table()[track]["rows"].items():
             assert {*row.split("+"), *attacks} <= known
             assert all(cost >= 0 for costs in attacks.values() for cost in costs.values())
+
+
+def test_what_is_measured_counts_the_processes_that_a_world_started() -> None:
+    costs = runpy.run_path(str(ROOT / "benchmarks" / "costs.py"), run_name="costs")
+    before, own = costs["cpu"](), time.process_time()
+    busy = "import time\nwhile time.process_time() < 0.5: pass"
+    subprocess.run([sys.executable, "-S", "-c", busy], check=True)
+    assert costs["cpu"]() - before > 0.4
+    assert time.process_time() - own < 0.3
 
 
 def test_a_dry_run_writes_nothing(bench: Bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

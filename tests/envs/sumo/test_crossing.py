@@ -39,6 +39,14 @@ def engine(batch: int, driver: str = "agent", processes: int = 1, **values: Any)
         yield made
 
 
+@pytest.mark.parametrize("lanes", [1, 3])
+def test_a_nearly_empty_crossing_has_few_cars_or_none(lanes: int) -> None:
+    for density, most in ((0.04, 8), (1e-6, 0)):
+        cell = CROSSING.cell(lanes=lanes, density=density, rule="yield")
+        for seed in range(SEED, SEED + 5):
+            assert 0 <= len(start(0, seed, cell, 24, Model.EGO)) - 1 <= most
+
+
 @needs_sumo
 def test_it_keeps_the_rules_of_every_world() -> None:
     assert broken("world", "sumo_crossing") == {}
