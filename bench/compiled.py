@@ -49,7 +49,7 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `inner`, but compiled into each caller anew: what one of them does with the result, or leaves unused, is optimised there."""
+    """As `inner`, but compiled into each caller anew, which does not compute what it does not use."""
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)(function)
 
 
@@ -60,7 +60,7 @@ def rounded_once(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @intrinsic
 def uncounted(context: Any, array: Any) -> Any:
-    """In compiled code: a view of an array that is not reference-counted, because each call that passes an array on counts twice.
+    """In compiled code: a view of an array without a reference count, because counting costs more than a short function does.
 
     The caller keeps the array alive.
     """

@@ -23,7 +23,7 @@ WIDTH = 4.0
 MARGIN = 1.0
 """Road.neighbour_vehicles: up to so many m beside a lane, cars are neighbours on it."""
 NEAR = 1.5
-"""While a body's distance from its lane in m plus its angle in rad is at most this, only a few lanes may be closer (`near`)."""
+"""While a body's distance from its lane in m plus its angle in rad is at most this, only lanes in `ROAD.near` may be closer."""
 
 
 class LaneKind(IntEnum):
@@ -329,7 +329,7 @@ def record(
     table = np.zeros(1, dtype=ROAD)
     road = table[0]
     road["lane_count"], road["edge_count"], road["end"] = lanes, len(roads), end
-    road["factor"], road["reach"], road["near"] = factor, _reach(roads), near(network.lanes())
+    road["factor"], road["reach"], road["near"] = factor, _reach(roads), _near(network.lanes())
     road["spots"][: len(spots)] = spots
     road["routes"] = road["route_lanes"] = -1
     if way is not None:
@@ -353,10 +353,10 @@ def record(
     return table
 
 
-def near(lanes: Sequence[Lane], spacing: float = 0.5) -> NDArray[np.int8]:
+def _near(lanes: Sequence[Lane], spacing: float = 0.5) -> NDArray[np.int8]:
     """[MOST_LANES, MOST_LANES] for each lane the numbers of those that may be closer to a body within `NEAR` of it, then -1.
 
-    A lane is left out if it is surely farther than `NEAR` from every such place; points on the lane are checked every `spacing` m.
+    A lane is left out if it is surely farther than `NEAR` from every such place. Points `spacing` m apart are checked.
     """
     table = np.full((MOST_LANES, MOST_LANES), -1, dtype=np.int8)
     for number, lane in enumerate(lanes):
