@@ -6,11 +6,11 @@
     python benchmarks/costs.py merge highway-v0       # these worlds
 
 The table is `bench/run/costs.json` (`cavbench.run.cost`), in CPU seconds of one thread. Each attack drives a small and a large
-batch in one cell; of a pair with published records only the first `DECISIONS` of each episode. What they took is a cost of each
-step of the longest episode and a cost of each step of every episode. `batch` is the first one for all steps that an episode can
-have, `episode` the second one for a mean episode. `length` is the mean length of an episode, as a share of all steps: that of the
-published records where they have the pair. `alone` is 1 where the units of the pair cannot be driven together. What is prepared
-is measured with little effort.
+batch in one cell, only the first `DECISIONS` where the length of episodes is known. What they took is a cost of each step of the
+longest episode and a cost of each step of every episode. `batch` is the first one for all steps that an episode can have,
+`episode` the second one for a mean episode. `length` is the mean length of an episode, as a share of all steps: that of the
+published records, or else what the table says; a pair that neither has drives a batch to the end. `alone` is 1 where the units of
+the pair cannot be driven together. What is prepared is measured with little effort.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from cavbench.leaderboard.published import every_track
 from cavbench.run.attempt import attempt
 from cavbench.run.config import plan_of
 from cavbench.run.cost import effort
+from cavbench.run.cost import table as costs
 from cavbench.run.process import settle
 from cavbench.run.task import Outcome, Task
 from cavbench.run.unit import Unit
@@ -99,17 +100,19 @@ def measured(words: Sequence[str], framework: Snapshot, cells: Sequence[str]) ->
         times = 1.0
     driving = unit.track.name == "driving"
     sizes, steps = DETECTED if not driving else DRIVEN, getattr(unit.pair.world.component, "max_steps", 1)
-    length = _published(unit.pair) if driving else None
+    length = _length(unit.pair) if driving else None
+    if driving and length is None and unit.pair.world.name == "highway":
+        length = float(_batch(unit, DRIVEN[0] * 3, artefacts, framework, cut=False)[0].mean()) / steps
     # What is made once, such as kernels and a road for SUMO, is no cost of a batch.
     _batch(unit, 1, artefacts, framework, cut=length is not None)
     few, seconds = _batch(unit, sizes[0], artefacts, framework, cut=length is not None)
     larger = sizes[1] if seconds < SLOW_S else SLOW
     many, more = _batch(unit, larger, artefacts, framework, cut=length is not None)
     per_step, per_row = _costs([few, many], [seconds, more])
-    length = length or float(many.mean())
-    found |= {"batch": per_step * steps / times, "episode": per_row * length / times}
+    length = length or float(many.mean()) / steps
+    found |= {"batch": per_step * steps / times, "episode": per_row * length * steps / times}
     if driving:
-        found["length"] = length / steps
+        found["length"] = length
         with _cut_short(1):
             jobs = [replace(unit.job, attack_seed=seed, seeds=unit.seeds[:1]) for seed in range(2)]
             if drive_jointly(jobs) is None:
@@ -126,12 +129,15 @@ def _cut_short(decisions: int) -> AbstractContextManager[object]:
     return patch("cavbench.driving.drive.rollout", short)
 
 
-def _published(pair: Pair) -> float | None:
-    """The mean steps of an episode of a pair in the published records; None if they do not have it."""
-    victim, defense = pair.victim.name, pair.defense.name
+def _length(pair: Pair) -> float | None:
+    """The mean length of an episode of a pair, as a share of all steps; None if it is not known, or of another world."""
     if pair.world.name != "highway":
         return None
-    return lengths().get((victim if defense == "none" else f"{victim}+{defense}", pair.attack.name))
+    victim, defense = pair.victim.name, pair.defense.name
+    row = victim if defense == "none" else f"{victim}+{defense}"
+    if steps := lengths().get((row, pair.attack.name)):
+        return steps / pair.world.component.max_steps
+    return costs()["driving"]["rows"].get(row, {}).get(pair.attack.name, {}).get("length")
 
 
 @cache

@@ -64,6 +64,16 @@ def test_a_filter_and_its_gradients_are_dearer() -> None:
     assert costs[1] > 5 * costs[0]
 
 
+@pytest.mark.parametrize(("defense", "alone"), [("smoothing", True), ("none", False)])
+def test_units_of_a_random_victim_share_nothing(defense: str, alone: bool) -> None:
+    plan = plan_of(["attack=pgd", f"defense={defense}", "episodes=2", "seeds=0", "workers=1", "reference=false"])
+    own, units = rates(plan.pairs[0]), len(plan.grid.cells())
+    _, seconds = plan.cost.by_pair[plan.pairs[0].id]
+    assert own.alone == alone
+    assert (seconds == pytest.approx(units * own.of(2))) == alone
+    assert seconds < 1.001 * units * own.of(2)
+
+
 def test_what_nobody_measured_is_said() -> None:
     assert "a guess, because nobody measured nudge" in str(plan_of(["attack=nudge", *SHORT]).cost)
 
