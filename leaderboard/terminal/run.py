@@ -129,8 +129,8 @@ def heading(one: Comparison) -> Table:
         lines.add_row("threat", Text(threat(one), style="dim"))
         for name, said in one.track.effort(one.own.column):
             lines.add_row(name, Text(said, style="dim"))
-        if said := certified_frames(one.own.table, one.track.certificates):
-            lines.add_row("certified", said)
+        if drawn := certified_frames(one.own.table, one.track.certificates):
+            lines.add_row("certified", drawn)
     for found in comparison_remarks(one):
         lines.add_row(Text("doubt", style="bold yellow"), Text(found.text, style="bold yellow"))
     for remark in remarks(one):
