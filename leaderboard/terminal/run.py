@@ -17,7 +17,7 @@ from cavbench.leaderboard.comparisons.naming import component, defended, varying
 from cavbench.leaderboard.comparisons.reading import read_comparisons
 from cavbench.leaderboard.ranking.remarks import comparison_remarks, run_remarks
 from cavbench.leaderboard.terminal.cells import cell_by_cell
-from cavbench.leaderboard.terminal.certified import certified_frames
+from cavbench.leaderboard.terminal.certified_frames import certified_frames
 from cavbench.leaderboard.terminal.overview import overview
 from cavbench.leaderboard.terminal.text import ATTACKED, BASELINE, CLEAN, MARKS, counted, of_frames, size, threat
 from cavbench.statistics.episodes import step_mean
