@@ -36,6 +36,8 @@ LIKE = {
     "detection": {"oblivious": "noise_patch", "scores": "square_patch", "gradients": "eot"},
 }
 """By track and by the access that it needs, the attack that stands for one whose cost nobody measured."""
+SAME = {"plain_patch": "grey_patch"}
+"""Attacks that do the same work as a measured one: only the colour differs."""
 START_S = 6.0
 """CPU seconds until the first unit begins: imports, and the networks."""
 UNIT_BYTES, EPISODE_BYTES, RECORDING_BYTES, ARTEFACT_BYTES = 46_000, 300, 700_000, 130_000
@@ -171,7 +173,7 @@ def rates(pair: Pair) -> Rates:
     if known is None:
         return Rates(0.0, 0.5, 0.1, (f"the track {pair.track}",))
     rows: Rows = known["rows"]
-    attack, unknown = pair.attack.name, []
+    attack, unknown = SAME.get(pair.attack.name, pair.attack.name), []
     measured = {name for row in rows.values() for name in row}
     if attack not in measured:
         unknown.append(attack)

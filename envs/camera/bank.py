@@ -273,7 +273,7 @@ class BankScenes(Scenes):
         return torch.tensor([_reach(pose, share, self.mount) for pose in self.poses], dtype=torch.float32)
 
     def _plate(self, number: int) -> Plate:
-        """The opened plate of a frame, cached in these scenes: about 1.6 MB."""
+        """The opened plate of a frame, cached in these scenes: about 2 MB."""
         if number not in self._plates:
             pose = self.poses[number]
             self._plates[number] = opened(self.frames[number], pose.camera, sign_x(pose.lanes))

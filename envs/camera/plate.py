@@ -28,6 +28,8 @@ LEAST_GAIN = 0.03
 
 Box = tuple[int, int, int, int]
 """x0, y0, x1, y1 in pixels of the image."""
+Samples = tuple[NDArray[np.float32], Tensor]
+"""Where the samples of pixels are on the face [h * S, w * S, 2], and their weights [h * S, w * S]; S is `SUPERSAMPLING`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +81,17 @@ class Plate:
             mixed = cover * shown + (1 - cover) * self.bare
             picture[within(self.crop, (0, 0, 0, 0))] = develop.tone(torch.where(self.lit, mixed, shown))
         return picture
+
+    def samples(self, part: Box) -> Samples:
+        """As `_weighted`; those of the latest part are kept, because a patch is rendered at its place again and again."""
+        if part not in self._kept:
+            self._kept.clear()
+            self._kept[part] = _weighted(part, self.face_from_pixel)
+        return self._kept[part]
+
+    @cached_property
+    def _kept(self) -> dict[Box, Samples]:
+        return {}
 
     @cached_property
     def lit(self) -> Tensor:
@@ -173,7 +186,7 @@ def signed(face: Tensor, parts: Sequence[tuple[Plate, Box]]) -> list[Tensor]:
         face: linear reflectances of the whole face [3, S, S], with S = `detail(crop)` of all plates.
         parts: a plate and a non-empty box inside its crop each.
     """
-    samples = [_weighted(part, plate.face_from_pixel) for plate, part in parts]
+    samples = [plate.samples(part) for plate, part in parts]
     shown = []
     for (plate, part), mean in zip(parts, _means_at(face, samples), strict=True):
         here = within(part, plate.crop)
@@ -181,8 +194,8 @@ def signed(face: Tensor, parts: Sequence[tuple[Plate, Box]]) -> list[Tensor]:
     return shown
 
 
-def _weighted(part: Box, face_from_pixel: Array) -> tuple[NDArray[np.float32], Tensor]:
-    """Where the samples of the pixels are on the face [h * S, w * S, 2], and their weights [h * S, w * S]."""
+def _weighted(part: Box, face_from_pixel: Array) -> Samples:
+    """The samples of the pixels of a part; their weights are 0 beyond the octagon."""
     place, inside = _inside(part, face_from_pixel)
     cover = inside.mean((1, 3), np.float32, keepdims=True)
     # Where the tracer saw a corner of the sign but no sample hits it, the border texel is used.
@@ -202,7 +215,7 @@ def _mean_at(texels: Tensor, place: NDArray[np.float32], weight: Tensor) -> Tens
     return mean
 
 
-def _means_at(texels: Tensor, samples: Sequence[tuple[NDArray[np.float32], Tensor]]) -> list[Tensor]:
+def _means_at(texels: Tensor, samples: Sequence[Samples]) -> list[Tensor]:
     """As `_mean_at`, for the samples of several parts: the texels are read once, and have one gradient."""
     grid = np.concatenate([place.reshape(-1, 2) for place, _ in samples])
     found = torch.nn.functional.grid_sample(

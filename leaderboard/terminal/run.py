@@ -18,7 +18,7 @@ from cavbench.leaderboard.comparisons.naming import component, defended, varying
 from cavbench.leaderboard.comparisons.reading import read_comparisons
 from cavbench.leaderboard.ranking.remarks import comparison_remarks, run_remarks
 from cavbench.leaderboard.terminal.cells import cell_by_cell
-from cavbench.leaderboard.terminal.certified import certified_frames
+from cavbench.leaderboard.terminal.certified_frames import certified_frames
 from cavbench.leaderboard.terminal.overview import common_sets, overview
 from cavbench.leaderboard.terminal.text import (
     ATTACKED,
@@ -146,8 +146,8 @@ def heading(one: Comparison) -> Table:
         lines.add_row("threat", Text(threat(one), style="dim"))
         for name, said in one.track.effort(one.own.column):
             lines.add_row(name, Text(said, style="dim"))
-        if certified := certified_frames(one.own.table, one.track.certificates):
-            lines.add_row("certified", certified)
+        if drawn := certified_frames(one.own.table, one.track.certificates):
+            lines.add_row("certified", drawn)
     for found in comparison_remarks(one):
         lines.add_row(Text("doubt", style="bold yellow"), Text(found.text, style="bold yellow"))
     for remark in remarks(one):

@@ -194,6 +194,16 @@ def test_after_a_tenth_of_the_work_the_time_left_is_right_within_a_quarter(slowe
     assert forecast.left == 0
 
 
+def test_a_plain_patch_costs_what_a_grey_one_does_and_is_no_guess() -> None:
+    grid = ("victim=yolov5", "lanes=3", "density=1", "weather=clear", "seeds=0", "episodes=2")
+    grey, plain = (
+        next(task.unit.pair for task in tasks_of("attack=grey_patch", *grid) if task.unit.pair.attack.name == name)
+        for name in ("grey_patch", "plain_patch")
+    )
+    assert rates(plain) == rates(grey)
+    assert not rates(plain).unknown
+
+
 def test_a_patch_that_was_to_cost_next_to_nothing_says_nothing_of_its_episodes() -> None:
     grid = ("lanes=3", "density=1", "weather=clear", "seeds=0", "episodes=2")
     drives = tasks_of("attack=grey_patch", "victim=yolov5", *grid, "reference=false")

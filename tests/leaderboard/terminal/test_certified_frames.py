@@ -5,7 +5,7 @@ from __future__ import annotations
 import pyarrow as pa
 
 from cavbench.core.track import track
-from cavbench.leaderboard.terminal.certified import certified_frames
+from cavbench.leaderboard.terminal.certified_frames import certified_frames
 from tests.leaderboard.synthetic import approach
 
 COLUMN = track("detection").certificates
