@@ -14,7 +14,7 @@ from cavbench.driving.fused.trainable import Trainable
 
 
 @inner
-def log_softmax(scores: Floats, allowed: NDArray[np.bool_], logs: Floats) -> float:
+def log_softmax(scores: Floats, allowed: NDArray[np.bool_], logs: Floats) -> np.float32:
     """Fills `logs` [A] with the logarithms of the probabilities, -inf where not allowed; returns the entropy.
 
     At least one action must be allowed.

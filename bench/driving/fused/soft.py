@@ -60,7 +60,7 @@ def _errors(
     """
     critics, count, actions = values.shape
     each, heat, share = np.float32(1) / np.float32(count), np.float32(alpha), np.float32(gap)
-    logs, sure = np.empty(actions, np.float32), 0.0
+    logs, sure = np.empty(actions, np.float32), np.float64(0)
     for n in range(count):
         log_softmax(scores_after[n], allowed_after[n], logs)
         later = np.float32(0)

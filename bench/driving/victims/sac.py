@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import torch
 from annotated_types import Interval
@@ -25,10 +25,12 @@ from torchrl.objectives import DiscreteSACLoss, SoftUpdate, ValueEstimators
 from cavbench.core.ranges import Count, Positive, Share
 from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.fused.categorical import Drawing
+from cavbench.driving.fused.network import Fused
 from cavbench.driving.fused.q_learning import Transitions
 from cavbench.driving.fused.soft import SoftActorCritic
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase, copy_weights
 from cavbench.driving.victims.logits import Logits, SoftPolicy
+from cavbench.driving.victims.networks import QNetwork
 from cavbench.driving.victims.practice import ALLOWED
 from cavbench.driving.victims.replay import Compiled, OffPolicyDriver, OffPolicyLearner
 
@@ -154,8 +156,8 @@ class _Compiled(Compiled):
         twins = copy.deepcopy(self.policy.critics)
         self.learning = SoftActorCritic(
             self.policy.network.fused,
-            [twin.fused for twin in twins],
-            [critic.fused for critic in self.policy.critics],
+            _fused(twins),
+            _fused(self.policy.critics),
             temperature=float(self.policy.temperature),
             least=recipe.least_temperature,
             heating=recipe.temperature_rate,
@@ -178,7 +180,7 @@ class _Compiled(Compiled):
         self.policy.temperature.fill_(self.learning.temperature)
 
     def average(self, policy: SoftPolicy) -> None:
-        self.learning.averaged(policy.network.fused, [critic.fused for critic in policy.critics])
+        self.learning.averaged(policy.network.fused, _fused(policy.critics))
 
 
 class _Torch:
@@ -272,3 +274,7 @@ class _Torch:
 
 def _critic(critic: nn.Module) -> TensorDictModule:
     return TensorDictModule(critic, in_keys=["observation"], out_keys=["action_value"])
+
+
+def _fused(critics: nn.ModuleList) -> list[Fused]:
+    return [cast(QNetwork, critic).fused for critic in critics]
