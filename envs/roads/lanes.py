@@ -131,7 +131,7 @@ def update_lane(body: Body, road: Road) -> None:
     least, along, across = heading_distance(road.lanes[before], body.x, body.y, body.heading, np.inf)
     close = least <= NEAR
     for place in range(road.lane_count):
-        number = np.int64(road.near[before, place]) if close else place
+        number: int = np.int64(road.near[before, place]) if close else place  # type: ignore[assignment]
         if number < 0:
             break
         if number != before:
