@@ -158,5 +158,5 @@ def test_records_of_worlds_are_a_file_a_defended_victim_and_rank_nothing_within_
     assert {name: again[name] - count for name, count in found.items()} == {n: c // 2 for n, c in found.items()}
     assert row_files(tmp_path) == []
     assert not (tmp_path / "rows").exists()
-    with pytest.raises(UserError, match="must have the records of attack=worlds alone, and has plan"):
-        publish_worlds(ran(tmp_path / "other", drive(attack="plan")), tmp_path)
+    with pytest.raises(UserError, match="must have the records of attack=worlds alone, and has pessimist"):
+        publish_worlds(ran(tmp_path / "other", drive(attack="pessimist")), tmp_path)
