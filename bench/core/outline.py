@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from types import new_class
-from typing import Any
+from typing import Any, ClassVar
 
 from cavbench.core import registry
 from cavbench.core.names import MARK
@@ -136,6 +136,8 @@ def _class(node: ast.ClassDef, module: str) -> type[Any]:
     for line in node.body:
         match line:
             case ast.AnnAssign(target=ast.Name(id=name), annotation=hint, value=value) if _is_of_class(hint):
+                # A field that overrides it keeps its place among the fields.
+                body["__annotations__"][name] = ClassVar[Any]
                 if value is not None:
                     body |= _if_clear(name, value, module)
             case ast.AnnAssign(target=ast.Name(id=name), annotation=hint, value=value):

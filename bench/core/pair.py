@@ -11,6 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from cavbench.core import registry, sets, sources
 from cavbench.core.contracts import Access, Attack, Defense, ThreatModel, Victim, World, permits
+from cavbench.core.outline import outline
 from cavbench.core.parameters import differing, parameters
 from cavbench.core.registry import Kind
 from cavbench.core.settings import frozen
@@ -82,12 +83,12 @@ def choose(kind: Kind, name: str, **params: object) -> Chosen[Any]:
 def label(kind: Kind, name: str, params: Mapping[str, Any]) -> str:
     """What tables call a component with the parameters of a record, as `str(Chosen)`.
 
-    It is not created, for anyone may write records.
+    It is not created, for anyone may write records, and not imported where its source says its defaults: that takes seconds.
 
     Raises:
         UserError: if there is no such component.
     """
-    owned = parameters(registry.load(kind, name))
+    owned = parameters(outline(kind, name) or registry.load(kind, name))
     given = {key: frozen(params[key]) for key in owned if key in params}
     changed = [
         f"{key}={value}" for key, value in given.items() if owned[key].required or value != frozen(owned[key].default)
