@@ -95,7 +95,7 @@ def save(
     """
     check_world(recipe, world)
     state = {key: value.contiguous() for key, value in network.state_dict().items()}
-    if broken := [key for key, value in state.items() if value.is_floating_point() and value.isnan().any()]:
+    if broken := _with_nan(state):
         raise UserError(
             f"training {recipe.name}, seed {seed} ended with NaN in {len(broken)} of {len(state)} tensors, {broken[0]!r} the "
             "first: nothing is saved; try a lower learning rate"
@@ -164,7 +164,7 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
         )
     blob, sha256 = _weights(path, entry)
     try:
-        tensors: Mapping[str, Tensor] = load_tensors(blob)
+        tensors = _tensors(blob)
         begun = entry.get("start")
         if not begun:
             _check_sizes(build, entry["shape"], tensors)
@@ -172,8 +172,6 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
         if begun:
             _check_start(recipe, seed, begun, network)
             tensors = _completed(tensors, begun["tensors"], network)
-        if broken := [name for name, one in tensors.items() if one.is_floating_point() and one.isnan().any()]:
-            raise ValueError(f"{broken[0]} has NaN")
         network.load_state_dict(tensors)
     except (
         SafetensorError,
@@ -209,11 +207,24 @@ def load_part(recipe: Recipe, seed: int, name: str, part: Module) -> str:
     blob, sha256 = _weights(path, entry)
     start = f"{name}."
     try:
-        stored = load_tensors(blob)
+        stored = _tensors(blob)
         part.load_state_dict({key.removeprefix(start): own for key, own in stored.items() if key.startswith(start)})
     except (SafetensorError, RuntimeError, ValueError) as error:
         raise UserError(f"the weights {path} do not fit {recipe.name!r}: {message(error)}") from None
     return sha256
+
+
+def _tensors(blob: bytes) -> Mapping[str, Tensor]:
+    """The tensors of a weights file; ValueError where one has NaN, for then all answers would be NaN."""
+    tensors: Mapping[str, Tensor] = load_tensors(blob)
+    if broken := _with_nan(tensors):
+        raise ValueError(f"{broken[0]} has NaN")
+    return tensors
+
+
+def _with_nan(tensors: Mapping[str, Tensor]) -> list[str]:
+    """The names of the tensors that have NaN."""
+    return [name for name, one in tensors.items() if one.is_floating_point() and one.isnan().any()]
 
 
 def own_files(recipe: Recipe, seed: int) -> tuple[Path, ...]:

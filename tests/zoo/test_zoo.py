@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import shlex
@@ -12,6 +13,7 @@ from typing import Any
 import pytest
 import torch
 from safetensors.torch import load_file
+from safetensors.torch import save as save_tensors
 
 from cavbench import zoo
 from cavbench.core import registry
@@ -78,6 +80,19 @@ def test_a_training_that_ended_with_nan_is_not_saved(home: Path, highway: Drivin
         zoo.save(network, RECIPE, seed=4, world=highway, card={})
     assert "\n" not in str(error.value)
     assert zoo.seeds(RECIPE) == [3]
+
+
+def test_weights_with_nan_are_refused_whole_and_in_part(saved: Path) -> None:
+    """Their card has the right hash."""
+    tensors = load_file(saved)
+    zoo.load_part(RECIPE, 3, "network", part := QPolicy(5, 5, 8).network)
+    assert torch.equal(part.head[0].weight, tensors["network.head.0.weight"])
+    tensors["network.head.0.weight"][0, 0] = float("nan")
+    saved.write_bytes(save_tensors(tensors))
+    changed(saved, lambda entry: entry.update(sha256=hashlib.sha256(saved.read_bytes()).hexdigest()))
+    for load in (lambda: zoo.load(RECIPE, 3, QPolicy), lambda: zoo.load_part(RECIPE, 3, "network", part)):
+        with pytest.raises(UserError, match=r"do not fit 'dqn': network\.head\.0\.weight has NaN"):
+            load()
 
 
 def test_tampered_weights_are_refused(saved: Path) -> None:
