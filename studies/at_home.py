@@ -27,7 +27,7 @@ def main() -> None:
     records = of_worlds()["driving"]
     (board,) = over_several(read_boards({"driving": records})[0])
     (row,) = (row for row in board.rows if row.method.home == EACH)
-    clean = {world: scores for world, *scores in duckdb.sql(CLEAN).fetchall()} if records.num_rows else {}
+    clean = {world: scores for world, *scores in duckdb.sql(CLEAN).fetchall()}
     console = Console(width=130)
     console.print(
         "| world | best blind | `dqn` of highway, clean | trained there, clean | trained there, attacked | perfect |"

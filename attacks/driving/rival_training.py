@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 from annotated_types import Interval
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
@@ -20,7 +20,7 @@ from cavbench.core.ranges import Count, NotNegative, Share, Width
 from cavbench.driving import Policy, State
 from cavbench.driving.sets import Traffic
 from cavbench.driving.traffic import View
-from cavbench.driving.victims.logits import Logits
+from cavbench.driving.victims.logits import Logits, sampled
 from cavbench.driving.victims.networks import QPolicy, StateValue
 from cavbench.errors import UserError
 
@@ -167,15 +167,7 @@ class Student:
             self.policy.network.head[-1].weight.mul_(0.1)
         self.actor = ProbabilisticTensorDictSequential(
             TensorDictModule(Logits(self.policy.network), in_keys=["observation"], out_keys=["logits"]),
-            ProbabilisticTensorDictModule(
-                in_keys=["logits"],
-                out_keys=["action"],
-                distribution_class=torch.distributions.Categorical,
-                distribution_kwargs={"validate_args": False},
-                default_interaction_type="random",
-                return_log_prob=True,
-                log_prob_key="action_log_prob",
-            ),
+            sampled(default_interaction_type="random"),
         )
         self.critic = TensorDictModule(
             StateValue(FEATURES, recipe.hidden), in_keys=["observation"], out_keys=["state_value"]

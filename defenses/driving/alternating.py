@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
@@ -18,6 +18,7 @@ from cavbench.defenses.driving.adversary import Adversary
 from cavbench.defenses.driving.recurrent import RecurrentPolicy
 from cavbench.driving import Policy, TrainingHooks
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
+from cavbench.driving.victims.logits import sampled
 from cavbench.driving.victims.networks import StateValue
 from cavbench.driving.victims.practice import Practice
 
@@ -86,15 +87,7 @@ class Alternation(Learner):
         game = TensorDictModule(
             Game(policy, adversary), in_keys=["observation", "memory", "first"], out_keys=["logits", "after"]
         )
-        action = ProbabilisticTensorDictModule(
-            in_keys=["logits"],
-            out_keys=["action"],
-            distribution_class=torch.distributions.Categorical,
-            distribution_kwargs={"validate_args": False},
-            return_log_prob=True,
-            log_prob_key="action_log_prob",
-        )
-        self.explore = self.actor = ProbabilisticTensorDictSequential(game, action)
+        self.explore = self.actor = ProbabilisticTensorDictSequential(game, sampled())
         self.loss = ClipPPOLoss(self.actor, self.critic, clip_epsilon=how.clip, critic_coeff=1.0)
         rates = {"policy": how.learning_rate, "adversary": how.adversary_rate}
         self.adams = {

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
+from tensordict.nn import ProbabilisticTensorDictModule
 from torch import Tensor, nn
 
 from cavbench.driving import State
@@ -44,3 +47,16 @@ class SoftPolicy(QPolicy):
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         return self.values(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
+
+
+def sampled(**more: Any) -> ProbabilisticTensorDictModule:
+    """Draws an `action` from the softmax of `logits`, with its `action_log_prob`; `more` as of the module of tensordict."""
+    return ProbabilisticTensorDictModule(
+        in_keys=["logits"],
+        out_keys=["action"],
+        distribution_class=torch.distributions.Categorical,
+        distribution_kwargs={"validate_args": False},
+        return_log_prob=True,
+        log_prob_key="action_log_prob",
+        **more,
+    )

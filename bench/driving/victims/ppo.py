@@ -9,7 +9,7 @@ from typing import Annotated
 import torch
 from annotated_types import Interval
 from tensordict import TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictModule, ProbabilisticTensorDictSequential, TensorDictModule
+from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
 from torch import Tensor
 from torchrl.envs import EnvBase
 from torchrl.objectives import ClipPPOLoss
@@ -20,7 +20,7 @@ from cavbench.driving import ActionType, Policy, TrainingHooks
 from cavbench.driving.fused.categorical import Drawing
 from cavbench.driving.fused.proximal import Proximal
 from cavbench.driving.victims.learner import CHUNK, Learner, Phase
-from cavbench.driving.victims.logits import Logits
+from cavbench.driving.victims.logits import Logits, sampled
 from cavbench.driving.victims.networks import QPolicy, StateValue
 from cavbench.driving.victims.practice import ALLOWED
 from cavbench.driving.victims.training import LearningDriver
@@ -230,14 +230,7 @@ class _Torch:
         read = ["observation"] if learner.mask is None else ["observation", learner.mask]
         self.actor = ProbabilisticTensorDictSequential(
             TensorDictModule(Logits(self.policy.network), in_keys=read, out_keys=["logits"]),
-            ProbabilisticTensorDictModule(
-                in_keys=["logits"],
-                out_keys=["action"],
-                distribution_class=torch.distributions.Categorical,
-                distribution_kwargs={"validate_args": False},
-                return_log_prob=True,
-                log_prob_key="action_log_prob",
-            ),
+            sampled(),
         )
         self.critic = TensorDictModule(learner.critic, in_keys=["observation"], out_keys=["state_value"])
         self.loss = ClipPPOLoss(

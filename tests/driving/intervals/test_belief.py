@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from unittest.mock import patch
 
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.defenses.driving.pessimist_q import Believing, PessimistQ
-from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import Policy
 from cavbench.driving.intervals import belief_kernels
 from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.victims.networks import QPolicy
+from tests.driving.intervals.compiled import (
+    drives_as_by_torch,
+    has_the_same_bits_everywhere,
+    takes_several_dimensions_and_none,
+)
 from tests.driving.intervals.drivers import FACTS
 from tests.driving.intervals.test_mask import drawn
 
@@ -41,7 +45,7 @@ def believing(policy: Policy | None = None, *, any_start: bool = False, pessimis
     return Believing(PessimistQ(pessimism=pessimism), behind, replace(FACTS, kinematics=kinematics)).eval()
 
 
-def by_torch() -> object:
+def by_torch() -> AbstractContextManager[object]:
     return patch.object(Belief, "fits", lambda self, observation, state: False)
 
 
@@ -94,41 +98,14 @@ def test_gradients_are_those_of_torch(seed: int, any_start: bool, network: bool)
 
 
 def test_a_row_has_the_same_bits_in_every_batch_and_place() -> None:
-    policy, (shown, state) = believing(), drawn(1, 120)
-
-    def both(rows: Tensor) -> tuple[Tensor, Tensor]:
-        asked = shown[rows].requires_grad_()
-        scores = policy.scores(asked, state[rows])
-        return scores.detach(), torch.autograd.grad(scores.sum(), asked)[0]
-
-    scores, slopes = both(torch.arange(120))
-    for rows in (torch.arange(120).flip(0), torch.tensor([7]), torch.arange(40, 73), torch.tensor([5, 5, 90])):
-        part, slope = both(rows)
-        assert torch.equal(part, scores[rows])
-        assert torch.equal(slope, slopes[rows])
+    policy = believing()
+    has_the_same_bits_everywhere(policy.scores, *drawn(1, 120))
 
 
 def test_several_leading_dimensions_and_no_points_are_answered() -> None:
-    policy, (shown, state) = believing(), drawn(2, 60)
-    flat = policy.scores(shown, state)
-    folded = shown.unflatten(0, (4, 15))
-    assert torch.equal(policy.scores(folded, state.reshape(4, 15)).flatten(0, 1), flat)
-    assert policy.scores(shown[:0], state[:0]).shape == (0, len(FACTS.actions))
+    policy = believing()
+    takes_several_dimensions_and_none(policy.scores, *drawn(2, 60))
 
 
 def test_a_tracked_belief_drives_as_by_torch() -> None:
-    """Scores and states over several decisions, with the boxes of the tracker in front."""
-    shown, _ = drawn(5, 80)
-    policy = Tracked(Tracker(), believing(), FACTS).eval()
-    state = other = policy.initial(torch.arange(80))
-    for step in range(6):
-        moved = shown.clone()
-        moved[..., 1] = (moved[..., 1] + 0.002 * step * moved[..., 0]).clamp(-1, 1)
-        scores = policy.scores(moved, state)
-        with by_torch():
-            assert torch.equal(policy.scores(moved, other), scores)
-            other = policy.advance(moved, scores.argmax(-1), other)
-        state = policy.advance(moved, scores.argmax(-1), state)
-    assert isinstance(state, TensorDict)
-    assert isinstance(other, TensorDict)
-    assert (state == other).all()
+    drives_as_by_torch(believing(), drawn(5, 80)[0], by_torch)

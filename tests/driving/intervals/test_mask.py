@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from unittest.mock import patch
 
@@ -13,7 +14,6 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.defenses.driving.shield import Shield, Shielded
-from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import Policy
 from cavbench.driving.intervals import filter_kernels
 from cavbench.driving.intervals.boxes import Boxes
@@ -21,6 +21,11 @@ from cavbench.driving.intervals.ego import Ego
 from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.victims.networks import QPolicy
 from tests.driving.intervals import by_torch as by_torch_code
+from tests.driving.intervals.compiled import (
+    drives_as_by_torch,
+    has_the_same_bits_everywhere,
+    takes_several_dimensions_and_none,
+)
 from tests.driving.intervals.drivers import FACTS
 
 ROWS = 6
@@ -70,7 +75,7 @@ def drawn(seed: int, count: int) -> tuple[Tensor, TensorDict]:
     return shown, TensorDict({"ego": TensorDict({**ego._asdict(), "known": known}, [count])}, [count])
 
 
-def by_torch() -> object:
+def by_torch() -> AbstractContextManager[object]:
     return patch.object(Mask, "fits", lambda self, observation, state: False)
 
 
@@ -124,26 +129,17 @@ def test_gradients_are_those_of_torch(seed: int, any_start: bool) -> None:
 
 
 def test_a_row_has_the_same_bits_in_every_batch_and_place() -> None:
-    policy, (shown, state) = shielded(), drawn(1, 120)
-
-    def both(rows: Tensor) -> tuple[Tensor, Tensor]:
-        asked = shown[rows].requires_grad_()
-        scores = policy.weighed(asked, policy.assumed.boxes(asked), state[rows])
-        return scores.detach(), torch.autograd.grad(scores.sum(), asked)[0]
-
-    scores, slopes = both(torch.arange(120))
-    for rows in (torch.arange(120).flip(0), torch.tensor([7]), torch.arange(40, 73), torch.tensor([5, 5, 90])):
-        part, slope = both(rows)
-        assert torch.equal(part, scores[rows])
-        assert torch.equal(slope, slopes[rows])
+    policy = shielded()
+    has_the_same_bits_everywhere(
+        lambda asked, known: policy.weighed(asked, policy.assumed.boxes(asked), known), *drawn(1, 120)
+    )
 
 
 def test_several_leading_dimensions_and_no_points_are_answered() -> None:
-    policy, (shown, state) = shielded(), drawn(2, 60)
-    flat = policy.weighed(shown, policy.assumed.boxes(shown), state)
-    folded = shown.unflatten(0, (4, 15))
-    assert torch.equal(policy.weighed(folded, policy.assumed.boxes(folded), state.reshape(4, 15)).flatten(0, 1), flat)
-    assert policy.weighed(shown[:0], policy.assumed.boxes(shown[:0]), state[:0]).shape == (0, len(FACTS.actions))
+    policy = shielded()
+    takes_several_dimensions_and_none(
+        lambda asked, known: policy.weighed(asked, policy.assumed.boxes(asked), known), *drawn(2, 60)
+    )
 
 
 @pytest.mark.parametrize("wanted", [torch.float64, torch.float32])
@@ -190,15 +186,4 @@ def test_boxes_within_tracks_and_their_gradients_are_those_of_torch(seed: int) -
 
 
 def test_a_tracked_filter_drives_as_by_torch() -> None:
-    """Scores and states over several decisions, with the boxes of the tracker in front."""
-    shown, _ = drawn(5, 80)
-    policy = Tracked(Tracker(), shielded(), FACTS).eval()
-    state = other = policy.initial(torch.arange(80))
-    for step in range(6):
-        moved = shown.clone()
-        moved[..., 1] = (moved[..., 1] + 0.002 * step * moved[..., 0]).clamp(-1, 1)
-        scores = policy.scores(moved, state)
-        with by_torch():
-            assert torch.equal(policy.scores(moved, other), scores)
-            other = policy.advance(moved, scores.argmax(-1), other)
-        state = policy.advance(moved, scores.argmax(-1), state)
+    drives_as_by_torch(shielded(), drawn(5, 80)[0], by_torch)
