@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -110,7 +111,10 @@ HONEST = (
 
 def sleepers() -> list[str]:
     """The processes that sleep for as long as those of these tests, whoever is their parent."""
-    commands = [one.read_bytes().split(b"\0") for one in Path("/proc").glob("[0-9]*/cmdline") if one.exists()]
+    commands = []
+    for one in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it may end between its listing and its reading
+            commands.append(one.read_bytes().split(b"\0"))
     return [repr(one) for one in commands if one[:1] == [b"sleep"] and one[1:2] in ([b"97"], [b"98"], [b"99"])]
 
 
