@@ -92,7 +92,7 @@ def _behind(config: TrainConfig) -> TrainConfig:
     chosen, victim = config.defense, config.victim.component
     if config.trained is not chosen or "behind" not in {field.name for field in fields(victim)}:
         return config
-    first, rest = None, None if chosen.component.seeded else (chosen.name, chosen.component)
+    first, rest = None, None if chosen.component.hardens else (chosen.name, chosen.component)
     if isinstance(chosen.component, Chain):
         first, rest = chosen.component.parted
     if rest is None or chosen.name == "none":

@@ -38,13 +38,21 @@ class Chain(Defense):
     def parted(self) -> tuple[tuple[str, Defense] | None, tuple[str, Defense] | None]:
         """The link that trains its victim, and those at run time as one defence: each with its name, or None."""
         named = [(name, getattr(self, name)) for name in self._fields()]
-        first, others = (named[0], named[1:]) if named[0][1].seeded else (None, named)
+        first, others = (named[0], named[1:]) if named[0][1].hardens else (None, named)
         if len(others) < 2:
             return first, next(iter(others), None)
         return first, (MARK.join(name for name, _ in others), _linked(*others))
 
     def lacks(self, world: Any) -> str:
         return next(filter(None, (link.lacks(world) for link in self.links)), "")
+
+    @property
+    def learns(self) -> bool:
+        return any(link.learns for link in self.links)
+
+    @property
+    def hardens(self) -> bool:
+        return any(link.hardens for link in self.links)
 
     @property
     def seeded(self) -> bool:
@@ -56,17 +64,17 @@ class Chain(Defense):
         Raises:
             UserError: names what to train.
         """
-        trained = [name for name in self._fields() if getattr(self, name).seeded]
+        trained = [name for name in self._fields() if getattr(self, name).learns]
         if trained:
-            raise UserError(f"train defense={trained[0]} by itself; the chain loads the trained victim")
+            raise UserError(f"train defense={trained[0]} by itself; the chain loads what was trained")
 
     def zoo_name(self, victim: Any) -> str:
-        trained = next((link for link in self.links if link.seeded), None)
+        trained = next((link for link in self.links if link.learns), None)
         return trained.zoo_name(victim) if trained else super().zoo_name(victim)
 
     def load(self, victim: Victim, seed: int, facts: Any) -> Any:
         first, *others = self.links
-        behind = (first, *reversed(others)) if first.seeded else (*reversed(self.links),)
+        behind = (first, *reversed(others)) if first.hardens else (*reversed(self.links),)
         for link in behind:
             victim = _defended(victim, link)
         return victim.load(seed, facts)
@@ -94,11 +102,11 @@ def chained(links: tuple[tuple[str, type[Defense]], ...]) -> type[Chain]:
     names = [name for name, _ in links]
     if len(set(names)) < len(names) or not all(name.isidentifier() for name in names):
         raise UserError(f"defense {MARK.join(names)!r}: a chain takes each defence once, and none as NAME:CHOICE")
-    if late := [name for name, link in links[1:] if link.train is not Defense.train]:
-        raise UserError(f"defense {MARK.join(names)!r}: {late[0]!r} trains its victim, so it must come first")
     for name, link in links:
         if needed := [one.name for one in fields(cast("Any", link)) if one.default is MISSING is one.default_factory]:
             raise UserError(f"defense {MARK.join(names)!r}: {name!r} needs {needed[0]}, but links have defaults")
+    if late := [name for name, link in links[1:] if link().hardens]:
+        raise UserError(f"defense {MARK.join(names)!r}: {late[0]!r} trains its victim, so it must come first")
     parts: list[Any] = [(name, link, field(default_factory=link)) for name, link in links]
     made = cast("type[Chain]", make_dataclass(MARK.join(names), parts, bases=(Chain,), frozen=True, kw_only=True))
     made.__module__ = Chain.__module__

@@ -263,9 +263,19 @@ class Defense(Component):
         return ""
 
     @property
-    def seeded(self) -> bool:
-        """Whether the defended victim depends on a training seed."""
+    def learns(self) -> bool:
+        """Whether it has weights of its own training, which the zoo keeps."""
         return type(self).train is not Defense.train
+
+    @property
+    def hardens(self) -> bool:
+        """Whether what it trains is the victim, so that it comes first in a chain; otherwise it stands around the victim."""
+        return self.learns
+
+    @property
+    def seeded(self) -> bool:
+        """Whether the defended victim depends on a training seed of the run."""
+        return self.learns
 
     def zoo_name(self, victim: Any) -> str:
         """The name of the zoo entries that `train` made from `victim`."""

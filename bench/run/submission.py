@@ -9,6 +9,7 @@ import json
 import shlex
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ import pyarrow.compute as pc
 
 from cavbench import bounded, files
 from cavbench.core import sets
+from cavbench.core.chain import Chain
 from cavbench.core.pair import Pair
 from cavbench.core.track import Track
 from cavbench.errors import UserError, short
@@ -169,12 +171,14 @@ def weights_of(pair: Pair, training_seeds: Sequence[int]) -> dict[str, Path | No
 
     victim, defense, attack = pair.victim.component, pair.defense.component, pair.attack.component
     recipes = [zoo.Recipe.of(victim)] if victim.learns else []
-    recipes += [zoo.Recipe.of(victim, defense)] if defense.seeded else []
+    links = defense.links if isinstance(defense, Chain) else (defense,)
+    # A detector from elsewhere has no name in a zoo: networks that serve all victims stand around it.
+    with suppress(UserError):
+        recipes += [zoo.Recipe.of(victim, link) for link in links if link.learns]
     recipes += [zoo.Recipe.of(victim, defense, attack)] if attack.learns else []
     # A detector is of a training seed of its own; those of the run are of its patches.
-    trained = {
-        part.component.trained for part in pair.parts if isinstance(getattr(part.component, "trained", None), int)
-    }
+    known = [getattr(part, "trained", None) for part in (victim, attack, *links)]
+    trained = {seed for seed in known if isinstance(seed, int)}
     found: dict[str, Path | None] = {}
     for recipe in recipes:
         for seed in sorted({*training_seeds, *trained}):

@@ -136,6 +136,10 @@ class Masking(DetectorDefense):
     trained_in: str = ""
 
     @property
+    def hardens(self) -> bool:
+        return False
+
+    @property
     def seeded(self) -> bool:
         return False
 

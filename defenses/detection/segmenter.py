@@ -110,6 +110,10 @@ class Segmenter(DetectorDefense):
     trained_in: str = ""
 
     @property
+    def hardens(self) -> bool:
+        return False
+
+    @property
     def seeded(self) -> bool:
         return False
 

@@ -72,6 +72,7 @@ def test_each_link_has_its_own_parameters() -> None:
         ("tracker+shield", {"shield.assumed_norm": "l2"}, "linf"),
         ("shield+shield", {}, "each defence once"),
         ("shield+advtrain", {}, "must come first"),
+        ("masking+advtrain_detection", {}, "must come first"),
         ("tracker+nosuch", {}, "nosuch"),
         ("tracker+jpeg", {}, "different tracks"),
         ("guard+frame_stack", {}, "'guard' needs digits, but links have defaults"),

@@ -193,6 +193,13 @@ def test_a_detector_is_submitted_with_the_weights_of_its_own_training_seed(toy_f
     words = "attack=eot victim=yolov5 victim.trained=3 world=camera"
     (pair,) = plan_of(words.split()).pairs
     assert {name.rpartition("/")[2] for name in weights_of(pair, [0, 1])} >= {"seed3.safetensors", "seed3.json"}
+    (hardened,) = plan_of(["attack=eot", "victim=yolov5", "defense=advtrain+masking", "world=camera"]).pairs
+    weights = {name.split("/")[-2].rpartition("-")[0] for name in weights_of(hardened, [0])}
+    assert weights == {"yolov5n", "yolov5n-advtrain-eot-skip0.3", "yolov5n-masking"}
+    (from_file,) = plan_of(
+        ["attack=grey_patch", "victim=detector", "victim.path=x.onnx", "defense=masking", "world=camera"]
+    ).pairs
+    assert weights_of(from_file, [0]) == {}
     # Its parameter `path` is empty: it names no file of this machine.
     assert not _names_a_file(json.loads(pair.victim.params))
     assert _names_a_file({"links": [{"path": "/etc/passwd"}]})

@@ -28,7 +28,7 @@ def defense_of(text: str) -> Defense:
     defense: Defense = configured("defense", name, parameter_words(" ".join(options))).component
     if not defense.serves("driving"):
         raise UserError(f"a driver cannot be trained behind {name!r}, which is for another track")
-    if defense.seeded:
+    if defense.hardens:
         raise UserError(f"a driver is trained behind defences that work at run time, {name!r} trains its victim")
     return defense
 

@@ -10,11 +10,13 @@ from safetensors.torch import load_file
 from torch import Tensor
 
 from cavbench import zoo
+from cavbench.core.options import choose
 from cavbench.defenses.detection import shared
 from cavbench.defenses.detection.judge import Judge
 from cavbench.defenses.detection.marker import Marker
 from cavbench.defenses.detection.masking import Masked, Masking
 from cavbench.defenses.detection.segmenter import Completed, Segmenter
+from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
 from cavbench.detection.victims.yolov5 import YOLOv5
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.errors import UserError
@@ -50,6 +52,22 @@ def test_the_networks_of_the_zoo_serve_a_victim_that_they_were_not_trained_besid
     hashes = {own.weights_sha256, masked.weights_sha256, completed.weights_sha256}
     assert len(hashes) == 3
     assert Masking().load(RedVictim(), 0, FACTS).weights_sha256 not in hashes
+
+
+def test_it_stands_around_a_hardened_detector_wherever_it_is_in_a_chain() -> None:
+    victim = YOLOv3Tiny()
+    hardened = choose("defense", "advtrain_detection").component.load(victim, 0, FACTS)
+    masked = choose("defense", "advtrain_detection+masking").component.load(victim, 0, FACTS)
+    completed = choose("defense", "median+segmenter").component.load(victim, 0, FACTS)
+    filtered = choose("defense", "advtrain_detection+median").component.load(victim, 0, FACTS)
+    assert isinstance(masked, Masked)
+    assert masked.inner.weights_sha256 == hardened.weights_sha256 == filtered.weights_sha256
+    judge = choose("defense", "masking").component.load(victim, 0, FACTS)
+    assert all(map(torch.equal, masked.judge.state_dict().values(), judge.judge.state_dict().values()))
+    assert len({one.weights_sha256 for one in (hardened, masked, judge, completed)}) == 4
+    pictures = torch.rand(1, 3, 64, 64, generator=torch.Generator().manual_seed(0))
+    known = hardened(pictures).scores
+    assert torch.equal(masked(pictures).scores[:, : known.shape[1]], known)
 
 
 def test_a_network_of_its_own_goes_before_the_shared_one_and_none_at_all_is_refused(
