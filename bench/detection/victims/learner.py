@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import ClassVar, Generic, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 from torch import Tensor
 from torch.optim.swa_utils import update_bn
 
+from cavbench import zoo
 from cavbench.core.contracts import Progress, Trained
 from cavbench.core.ranges import Count, Natural, Positive, Share
 from cavbench.detection import CameraWorld, Detector, DetectorVictim
+from cavbench.detection.victims.checkpoint import Checkpoint
 from cavbench.detection.victims.examples import Example, Examples
 from cavbench.detection.victims.training import descend
 from cavbench.detection.victims.windows import Windows
@@ -23,6 +26,8 @@ ZOOM = (0.6, 1.2)
 """Smallest and largest side of a training window in the image, as multiples of `window`."""
 CALIBRATION = 40
 """Batches for computing the statistics of the batch normalisations after the training."""
+KEPT_EVERY = 100
+"""Updates between two writes of an unfinished training."""
 STRIDE = 32
 """The side of a window is a multiple of it."""
 
@@ -43,6 +48,8 @@ class Learner(DetectorVictim, Generic[Network]):
     """
 
     learns: ClassVar[bool] = True
+    decay: ClassVar[float] = 0.998
+    """Decay of the average of the weights, per update; a short training needs a faster one, to forget its random weights."""
 
     trained: Natural = 0
     updates: Count = 2400
@@ -72,20 +79,34 @@ class Learner(DetectorVictim, Generic[Network]):
         """What an update lowers."""
 
     def train(self, world: CameraWorld, *, seed: int, progress: Progress) -> Trained[Detector]:
-        """Train a detector from scratch on windows of the training scenes, with all objects in them as targets."""
+        """Train a detector on windows of the training scenes, with all objects in them as targets.
+
+        A training that was stopped goes on where it was last kept.
+        """
         scenes = world.training_scenes()
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
             network = self.begun(world.classes).train()
             generator = torch.Generator().manual_seed(seed)
             windows = Windows(scenes, self.window, zoom=ZOOM, away=self.away, generator=generator)
+
+            def restore(held: Mapping[str, Any]) -> None:
+                generator.set_state(held["generator"])
+
             examples = Examples(scenes, windows, network.index, decoys=self.decoys, generator=generator)
             trained, seconds = descend(
                 network,
                 lambda update: self.loss(network, examples.draw(self.batch)),
                 updates=self.updates,
                 learning_rate=self.learning_rate,
+                decay=self.decay,
                 progress=progress,
+                checkpoint=Checkpoint(
+                    zoo.unfinished(zoo.Recipe.of(self), seed),
+                    KEPT_EVERY,
+                    held=lambda: {"generator": generator.get_state()},
+                    restore=restore,
+                ),
             )
             # The averaged weights need their own batch-norm statistics.
             update_bn((examples.draw(self.batch).pictures for _ in range(CALIBRATION)), trained)

@@ -11,6 +11,8 @@ import torch
 from cavbench import zoo
 from cavbench.detection import STOP_SIGN, Detector
 from cavbench.detection.approach import score
+from cavbench.detection.victims import learner
+from cavbench.detection.victims.detr import DETR
 from cavbench.detection.victims.examples import Examples
 from cavbench.detection.victims.fcos import FCOS
 from cavbench.detection.victims.learner import Learner
@@ -24,7 +26,7 @@ from tests.detection.drawn_street import DrawnStreet
 
 FACTS = StopSignApproach().facts
 SIDE = 128
-LEARNERS = [FCOS, RCNN, YOLOv5]
+LEARNERS = [DETR, FCOS, RCNN, YOLOv5]
 
 Kind = type[Learner[Detector]]
 
@@ -80,6 +82,29 @@ def test_a_trained_detector_is_found_in_the_zoo(kind: Kind, tmp_path: Path, monk
     torch.testing.assert_close(loaded(pictures).scores, made.network(pictures).scores, rtol=1e-2, atol=1e-3)
     with pytest.raises(UserError, match="training seed 5"):
         replace(victim, trained=5).load(0, FACTS)
+
+
+@pytest.mark.parametrize("kind", LEARNERS)
+def test_a_training_that_was_stopped_ends_as_one_that_was_not(
+    kind: Kind, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVBENCH_ZOO", str(tmp_path))
+    monkeypatch.setattr(learner, "KEPT_EVERY", 4)
+    victim = kind(updates=12, batch=2, window=64, trained_in="DrawnStreet")
+
+    def stop(share: float, text: str) -> None:
+        if share > 0.5:
+            raise KeyboardInterrupt
+
+    whole = victim.train(DrawnStreet(), seed=4, progress=lambda share, text: None)
+    with pytest.raises(KeyboardInterrupt):
+        victim.train(DrawnStreet(), seed=4, progress=stop)
+    begun: list[float] = []
+    made = victim.train(DrawnStreet(), seed=4, progress=lambda share, text: begun.append(share))
+    assert begun[0] > 0.3, "it began again"
+    for name, weight in whole.network.state_dict().items():
+        assert torch.equal(weight, made.network.state_dict()[name]), name
+    assert not list(tmp_path.rglob("*.unfinished"))
 
 
 @pytest.mark.parametrize("kind", LEARNERS)
