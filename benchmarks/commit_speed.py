@@ -33,7 +33,7 @@ class Worker:
     """A process that drives with the code of a folder."""
 
     def __init__(self, folder: Path) -> None:
-        subprocess.run(["make", "-s", "tree"], cwd=folder, check=True)
+        subprocess.run(["make", "-s", "tree", "VENV=/nonexist"], cwd=folder, check=True)
         # The folder of this file comes first on a script's path, not that of the package: both are asked for here.
         environment = {**os.environ, "PYTHONPATH": str(folder / "build" / "tree")}
         self.process = subprocess.Popen(
@@ -93,7 +93,8 @@ def main() -> None:
             ones, others = (rounds[0][side]["columns"] for side in (0, 1))
             same = sum(ones[name] == others[name] for name in ones)
             print(
-                f"| {defense} | {attack} | {before:.3f} | {now:.3f} | {ratio:.2f} x | {same} of {len(ones)} |", flush=True
+                f"| {defense} | {attack} | {before:.3f} | {now:.3f} | {ratio:.2f} x | {same} of {len(ones)} |",
+                flush=True,
             )
 
 

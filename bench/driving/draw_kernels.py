@@ -15,9 +15,7 @@ from cavbench.compiled import entry_point, inner
 
 BLOCK = 64
 """Points whose bits are drawn before they are made into normal numbers."""
-GOLDEN, FIRST, SECOND = (
-    np.uint64(value) for value in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
-)
+GOLDEN, FIRST, SECOND = (np.uint64(value) for value in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
 LN2, HALF_PI = np.float32(0.6931471805599453), np.float32(1.5707963267948966)
 ONE, TWO = np.float32(1), np.float32(2)
 PER_HALF, PER_ROUND = np.float32(2.0**-31), np.float32(2.0**-32)
@@ -48,9 +46,7 @@ def _sine(x: np.float32) -> np.float32:
     """Of -pi / 2 to pi / 2, by its series."""
     s = x * x
     series = np.float32(1 / 362880) - s * (np.float32(1 / 39916800) - s * np.float32(1 / 6227020800))
-    return x * (
-        ONE - s * (np.float32(1 / 6) - s * (np.float32(1 / 120) - s * (np.float32(1 / 5040) - s * series)))
-    )
+    return x * (ONE - s * (np.float32(1 / 6) - s * (np.float32(1 / 120) - s * (np.float32(1 / 5040) - s * series))))
 
 
 @inner

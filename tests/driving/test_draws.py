@@ -63,7 +63,9 @@ def test_noise_is_splitmix_and_box_and_muller() -> None:
         expected.append((length * math.cos(angle), length * math.sin(angle)))
     with given(torch.tensor([number])):
         found = noise(torch.zeros(1, 2, 5)).flatten()
-    torch.testing.assert_close(found.double(), torch.tensor(expected, dtype=torch.float64).T.flatten(), atol=2e-6, rtol=0)
+    torch.testing.assert_close(
+        found.double(), torch.tensor(expected, dtype=torch.float64).T.flatten(), atol=2e-6, rtol=0
+    )
 
 
 def test_noise_has_the_same_bits_in_every_batch_and_place() -> None:

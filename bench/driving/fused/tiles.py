@@ -9,7 +9,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
@@ -20,6 +19,8 @@ from cavbench.compiled import rounded_once
 WIDTH, HEIGHT = 16, 8
 """Points and outputs in a tile: eight vectors of the largest registers, so that a sum is ready when its next term is."""
 
+ir = cgutils.ir
+"""LLVM's language, of the version that numba itself writes."""
 _VECTOR = ir.VectorType(ir.FloatType(), WIDTH)
 _SIZE = ir.IntType(64)
 
@@ -72,7 +73,17 @@ def _tile(height: int) -> Any:
 
     @intrinsic
     def add(
-        context: Any, x: Any, start: Any, used: Any, count: Any, weights: Any, at: Any, across: Any, along: Any, y: Any, j: Any
+        context: Any,
+        x: Any,
+        start: Any,
+        used: Any,
+        count: Any,
+        weights: Any,
+        at: Any,
+        across: Any,
+        along: Any,
+        y: Any,
+        j: Any,
     ) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             shown, start, numbers, count, factors, at, across, along, sums, j = given
