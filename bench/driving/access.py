@@ -156,7 +156,7 @@ class Oracle:
                 return loss(self._mean(scores.unflatten(0, points.shape[:-2])))
 
         with subject.asked():
-            value, gradient = subject.differentiated(points.flatten(0, -3), state, of_scores)
+            value, gradient = subject.differentiated(points.flatten(0, -3), state, of_scores, self._numbers(points))
         gradient = gradient.reshape(points.shape).flatten(-2)
         gradient = self._enforcer.gradients.cleaned(gradient, self._rows, observed=True).reshape(points.shape)
         return value, gradient if self.draws == 1 else gradient.sum(0)
@@ -170,7 +170,8 @@ class Oracle:
         points, actions, subject = self._repeated(observation), self._repeated(action), self._enforcer.subject
         state = self._paid("gradients", points)
         with subject.asked():
-            value, gradient = subject.valued(points.flatten(0, -3), actions.flatten(0, points.ndim - 3), state)
+            asked = points.flatten(0, -3), actions.flatten(0, points.ndim - 3)
+            value, gradient = subject.valued(*asked, state, self._numbers(points))
         value = value.reshape(points.shape[:-2])
         if gradient is not None:
             gradient = self._enforcer.gradients.cleaned(gradient.reshape(actions.shape), self._rows)
@@ -224,7 +225,7 @@ class Oracle:
         if state is not None and len(state) != len(flat):
             raise UserError(f"the attack rehearsed {len(flat)} episodes with the state of {len(state)}")
         with subject.asked(), torch.no_grad():
-            action = subject.policy.choose(subject.answered(flat, state))
+            action = subject.policy.choose(subject.answered(flat, state, self._numbers(observation)))
             after = subject.advance(flat, action, state)
         return action.unflatten(0, observation.shape[:-2]).clone(), after
 
@@ -233,13 +234,20 @@ class Oracle:
         points = self._repeated(observation)
         state = self._paid(access, points)
         with self._enforcer.subject.asked():
-            scores = self._enforcer.subject.answered(points.flatten(0, -3), state)
+            scores = self._enforcer.subject.answered(points.flatten(0, -3), state, self._numbers(points))
         return scores.unflatten(0, points.shape[:-2])
 
     def _paid(self, access: Access, points: Tensor) -> State:
         """Count the queries [..., B, V, F]; the victim's state for each of them, flattened to [N]."""
         self._enforcer.spend(access, self._step, points, self._rows)
         return self._enforcer.remembered(self._rows, points.shape[:-3].numel())
+
+    def _numbers(self, points: Tensor) -> Tensor | None:
+        """Numbers for the draws of a random victim at points [..., B, V, F], flattened to [N]."""
+        rows = self._enforcer.rows
+        return self._enforcer.subject.numbers(
+            rows if self._rows is None else rows[self._rows], points.shape[:-3].numel()
+        )
 
     def _repeated(self, points: Tensor) -> Tensor:
         """`draws` copies of the points, [D, ...]; the points themselves if one is enough."""

@@ -128,7 +128,8 @@ class Meter:
         changed = np.zeros(len(touched))
         if touched.any():
             rows = torch.from_numpy(touched)
-            taken, clean = action[rows], self.subject.decided(truth[rows], rows_of(state, rows))
+            numbers = self.subject.numbers(rows.nonzero().squeeze(1))
+            taken, clean = action[rows], self.subject.decided(truth[rows], rows_of(state, rows), numbers)
             if self.subject.action_type == "discrete":
                 changed[touched] = (clean != taken).numpy()
             else:

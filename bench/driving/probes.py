@@ -91,6 +91,7 @@ class Probe:
         state: State,
         asked: Sequence[tuple[Tensor | None, Tensor]] | None,
         rehearsal: tuple[int, Tensor | None] | None = None,
+        numbers: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The scores and actions of a step, as `CountedPolicy.driven`, and probes before or after it.
 
@@ -101,6 +102,7 @@ class Probe:
             state: the victim's state.
             asked: the attack's queries of this step, as in `count_draws`; None if no probe is due.
             rehearsal: the copies and the episodes, by index among the running ones, of the attack's last rehearsal.
+            numbers: for the draws of the step, int64 [B]; probes draw from their own stream.
         """
         due = asked is not None
         if due and self.shadow is None:
@@ -109,7 +111,7 @@ class Probe:
         first = self.shadows.random() < 0.5
         if self.shadow and first:
             self.shadow.ask(shown)
-        scores, action = self.subject.driven(shown, state)
+        scores, action = self.subject.driven(shown, state, numbers)
         if due:
             question, answer = before or self._ask(shown, running, state)
             if len(question.rows):

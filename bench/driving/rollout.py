@@ -19,6 +19,7 @@ from cavbench.core.progress import share_done
 from cavbench.driving.attacker import Attacker, Shown
 from cavbench.driving.blame import Deeds, Judge, unknown
 from cavbench.driving.contracts import DrivingAttack
+from cavbench.driving.draws import Draws
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import DrivingFacts
 from cavbench.driving.meter import Columns, Meter
@@ -115,7 +116,8 @@ def rollout(
         unchanged({type(attack).__name__: attack} if attack else {}, "attack"),
         Watch(policy, "victim", listens=attack is not None) as watch,
     ):
-        subject = CountedPolicy(policy, watch, attacks_draws)
+        keys = torch.cat([opaque([seed], ["draws", salt]) for seed, salt in zip(seeds, salts, strict=True)])
+        subject = CountedPolicy(policy, watch, attacks_draws, Draws(keys))
         attacker = Attacker(
             attack,
             subject,
@@ -146,9 +148,10 @@ def rollout(
             shown = attacker.show(truth, running, state, _view(attack, td))
             if probing or probe.shadow:
                 rehearsal = attacker.enforcer.rehearsed
-                scores, action = probe.driven(shown.observation, truth, running, state, asked, rehearsal)
+                shared = truth, running, state, asked, rehearsal
+                scores, action = probe.driven(shown.observation, *shared, subject.numbers())
             else:
-                scores, action = subject.driven(shown.observation, state)
+                scores, action = subject.driven(shown.observation, state, subject.numbers())
             executed = attacker.execute(action)
             if shown.orders is not None:
                 td["orders"] = shown.orders
@@ -181,6 +184,8 @@ def _view(attack: DrivingAttack | None, td: TensorDictBase) -> View | None:
 
 def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, facts: DrivingFacts) -> None:
     scores = subject.aside(observation, state)
+    if subject.draws:
+        subject.aside(observation, state, torch.arange(len(observation)))
     if subject.action_type == "discrete" and facts.actions:
         count = scores.shape[-1]
         if count != len(facts.actions):
@@ -197,27 +202,28 @@ def _check_rows(subject: CountedPolicy, observation: Tensor, state: State, gradi
 
     def answers(rows: Tensor) -> list[Tensor]:
         shown, own = observation[rows], rows_of(state, rows)
-        scores = subject.aside(shown, own)
+        numbers = rows if subject.draws else None
+        scores = subject.aside(shown, own, numbers)
         if not gradients:
             return [scores]
-        found = [scores, _slope(subject, shown, own)]
+        found = [scores, _slope(subject, shown, own, numbers)]
         if subject.action_type == "continuous":
             with suppress(NotImplementedError), Stream("aside").in_use():
-                value, slope = subject.valued(shown, scores, own)
+                value, slope = subject.valued(shown, scores, own, numbers)
                 found += [value] if slope is None else [value, slope]
         return found
 
     order = torch.arange(len(observation))
     whole = answers(order)
     for size in range(1, min(LARGEST, len(order))):
-        if subject.draws or not all(map(torch.equal, answers(order[-size:]), (one[-size:] for one in whole))):
+        if subject.shares or not all(map(torch.equal, answers(order[-size:]), (one[-size:] for one in whole))):
             raise NotJointError
 
 
-def _slope(subject: CountedPolicy, observation: Tensor, state: State) -> Tensor:
+def _slope(subject: CountedPolicy, observation: Tensor, state: State, numbers: Tensor | None) -> Tensor:
     """[B, V, F] the gradient of the summed scores."""
     with Stream("aside").in_use():
-        return subject.differentiated(observation, state, lambda scores: scores.sum(-1))[1]
+        return subject.differentiated(observation, state, lambda scores: scores.sum(-1), numbers)[1]
 
 
 def _traced(

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
+from cavbench.driving.draws import Draws, given
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import finite
 from cavbench.errors import UserError
@@ -33,17 +34,28 @@ class CountedPolicy:
         policy: the (defended) victim.
         watch: a watch on it; None in trainings and checks.
         stream: random numbers of the attack; None for those of the process.
+        numbers: numbers of what the victim draws for each episode; None for the generators of the process.
 
-    `draws` says whether the victim was seen to draw from a global generator; the generators are then exchanged around every
-    query, which takes time.
+    `draws` says whether the victim was seen to draw. `shares` says whether it draws from the generators of the process, although
+    it was given numbers: they are then exchanged around every query, which takes time.
     """
 
-    def __init__(self, policy: Policy, watch: Watch | None = None, stream: Stream | None = None) -> None:
-        self.policy, self.watch, self.stream = policy, watch, stream
+    def __init__(
+        self,
+        policy: Policy,
+        watch: Watch | None = None,
+        stream: Stream | None = None,
+        numbers: Draws | None = None,
+    ) -> None:
+        self.policy, self.watch, self.stream, self._numbers = policy, watch, stream, numbers
         self.action_type = policy.action_type
         self.evaluations = 0
-        self.draws = False
+        self.draws = self.shares = False
         self._foreign = False
+
+    def numbers(self, rows: Tensor | None = None, copies: int = 1) -> Tensor | None:
+        """Numbers for the draws of a call, as of `Draws.numbers`; None if the victim draws nothing, or by no numbers."""
+        return self._numbers.numbers(rows, copies) if self.draws and self._numbers else None
 
     @contextmanager
     def turn(self) -> Iterator[None]:
@@ -68,11 +80,11 @@ class CountedPolicy:
         if before == foreign:
             yield
             return
-        self._switch(foreign, self.stream if self.draws else None)
+        self._switch(foreign, self.stream if self.shares else None)
         try:
             yield
         finally:
-            self._switch(before, self.stream if self.draws else None)
+            self._switch(before, self.stream if self.shares else None)
 
     def _switch(self, foreign: bool, stream: Stream | None) -> None:
         self._foreign = foreign
@@ -93,43 +105,55 @@ class CountedPolicy:
         after = self.policy.advance(plain(observation), action.clone(), state)
         return None if after is None else after.clone()
 
-    def aside(self, observation: Tensor, state: State) -> Tensor:
-        """The scores [B, A], from random numbers of their own; notes in `draws` whether they took any."""
+    def aside(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
+        """The scores [B, A], from random numbers of their own; notes in `draws` and `shares` whether they took any."""
         own = Stream("aside")
         with own.in_use():
             before = own.marks()
-            scores = self._scores(plain(observation), state, "while driving")
-            self.draws = self.draws or own.marks() != before
+            scores = self._scores(plain(observation), state, "while driving", numbers)
+            drew = own.marks() != before
+        self.draws |= drew
+        self.shares |= drew and (numbers is not None or self._numbers is None)
         return scores
 
-    def driven(self, observation: Tensor, state: State) -> tuple[Tensor, Tensor]:
+    def driven(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """The scores [B, A] (or [B, 2]) and the actions with which the victim drives.
+
+        Args:
+            observation: [B, V, F].
+            state: of these episodes.
+            numbers: for its draws, int64 [B]; None for the generators of the process. So in all that asks the victim.
 
         Raises:
             UserError: if the scores are NaN, infinite or complex.
         """
-        scores = self._scores(plain(observation), state, "while driving")
+        scores = self._scores(plain(observation), state, "while driving", numbers)
         return scores, self.policy.choose(scores)
 
-    def decided(self, observation: Tensor, state: State) -> Tensor:
+    def decided(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
         """The actions [B] for observations [B, V, F], as in `driven`."""
-        return self.policy.choose(self._scores(plain(observation), state))
+        return self.policy.choose(self._scores(plain(observation), state, numbers=numbers))
 
     @torch.no_grad()
-    def answered(self, observation: Tensor, state: State) -> Tensor:
+    def answered(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
         """The scores of observations [N, V, F], evaluated in batches of at most `CHUNK`."""
         # The policy gets a copy: one that writes to its input would change the attack's points.
         flat = plain(observation)
         if len(flat) <= CHUNK:
-            return self._scores(flat, state).clone()
+            return self._scores(flat, state, numbers=numbers).clone()
         # Parts of the same size: a small rest would cost almost as much as a full batch.
         size = -(-len(flat) // -(-len(flat) // CHUNK))
         parts = flat.split(size)
         states = [None] * len(parts) if state is None else state.split(size)
-        return torch.cat(list(map(self._scores, parts, states)))
+        own = [None] * len(parts) if numbers is None else numbers.split(size)
+        return torch.cat([self._scores(*part[:2], numbers=part[2]) for part in zip(parts, states, own, strict=True)])
 
     def differentiated(
-        self, observation: Tensor, state: State, loss: Callable[[Tensor], Tensor]
+        self,
+        observation: Tensor,
+        state: State,
+        loss: Callable[[Tensor], Tensor],
+        numbers: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """The value of `loss` [...] of the scores of observations [N, V, F], and its gradient [N, V, F].
 
@@ -138,7 +162,7 @@ class CountedPolicy:
         """
         asked = observation.detach().clone().requires_grad_(True)
         with torch.enable_grad():
-            scores = self._scores(asked, state)
+            scores = self._scores(asked, state, numbers=numbers)
             shown = scores.detach().clone().requires_grad_(True)
             value = loss(shown)
             outer = torch.autograd.grad(value.sum(), shown, allow_unused=True)[0] if value.requires_grad else None
@@ -147,26 +171,33 @@ class CountedPolicy:
             (gradient,) = torch.autograd.grad(scores, asked, outer, allow_unused=True)
         return value.detach(), torch.zeros_like(asked).detach() if gradient is None else gradient
 
-    def valued(self, observation: Tensor, action: Tensor, state: State) -> tuple[Tensor, Tensor | None]:
+    def valued(
+        self, observation: Tensor, action: Tensor, state: State, numbers: Tensor | None = None
+    ) -> tuple[Tensor, Tensor | None]:
         """The critic Q(observation, action) [N], and its gradient [N, 2] in the action; None for discrete actions."""
         self.evaluations += len(observation)
         asked = action.detach().clone()
         if not asked.is_floating_point():
-            return self.policy.value(observation.clone(), asked, state).detach(), None
+            with given(numbers):
+                return self.policy.value(observation.clone(), asked, state).detach(), None
         asked.requires_grad_(True)
         with torch.enable_grad():
-            value = self.policy.value(observation.clone(), asked, state)
+            with given(numbers):
+                value = self.policy.value(observation.clone(), asked, state)
             found = torch.autograd.grad(value.sum(), asked, allow_unused=True) if value.requires_grad else (None,)
         return value.detach(), torch.zeros_like(asked).detach() if found[0] is None else found[0]
 
-    def _scores(self, observation: Tensor, state: State, where: str = "to a query") -> Tensor:
+    def _scores(
+        self, observation: Tensor, state: State, where: str = "to a query", numbers: Tensor | None = None
+    ) -> Tensor:
         """The scores of the policy.
 
         Raises:
             UserError: if they are NaN or infinite: no attack could choose such a point, so the victim would look robust.
         """
         self.evaluations += len(observation)
-        scores = self.policy.scores(observation, state)
+        with given(numbers):
+            scores = self.policy.scores(observation, state)
         if type(scores) is not Tensor:
             raise TamperError(f"the victim's scores are a {type(scores).__name__}, not a torch.Tensor", "defense")
         if not finite(scores) and not bool(scores.isfinite().all()):

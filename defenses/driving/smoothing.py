@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cavbench.core.ranges import Positive
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
+from cavbench.driving.draws import noise
 from cavbench.errors import UserError
 
 
@@ -59,5 +60,5 @@ class Smoothed(PolicyWrapper):
     def noisy(self, observation: Tensor) -> Tensor:
         """The observation [..., V, F] with noise on the measured values of the rows that are present."""
         shift = torch.zeros_like(observation)
-        shift[..., 1:] = torch.randn_like(observation[..., 1:]) * self.noise * (observation[..., :1] > 0)
+        shift[..., 1:] = noise(observation) * self.noise * (observation[..., :1] > 0)
         return observation + shift

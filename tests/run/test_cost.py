@@ -7,6 +7,7 @@ import runpy
 import subprocess
 import sys
 import time
+from copy import deepcopy
 from io import StringIO
 from pathlib import Path
 
@@ -64,9 +65,13 @@ def test_a_filter_and_its_gradients_are_dearer() -> None:
     assert costs[1] > 5 * costs[0]
 
 
-@pytest.mark.parametrize(("defense", "alone"), [("smoothing", True), ("none", False)])
-def test_units_of_a_random_victim_share_nothing(defense: str, alone: bool) -> None:
-    plan = plan_of(["attack=pgd", f"defense={defense}", "episodes=2", "seeds=0", "workers=1", "reference=false"])
+@pytest.mark.parametrize("alone", [True, False])
+def test_units_that_are_driven_alone_share_nothing(alone: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of a victim that draws from the generators of the process; `smoothing` does not."""
+    known = deepcopy(table())
+    known["driving"]["rows"]["dqn+smoothing"]["pgd"] |= {"alone": 1.0} if alone else {}
+    monkeypatch.setattr("cavbench.run.cost.table", lambda: known)
+    plan = plan_of(["attack=pgd", "defense=smoothing", "episodes=2", "seeds=0", "workers=1", "reference=false"])
     own, units = rates(plan.pairs[0]), len(plan.grid.cells())
     _, seconds = plan.cost.by_pair[plan.pairs[0].id]
     assert own.alone == alone

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point, rounded_once
+from cavbench.driving.fused import tiles
 
 LANES, GRAIN = 64, 16
 """Points in a block, and what the number of points in the last one is rounded up to: the width of the largest registers."""
@@ -158,7 +159,7 @@ def _encode(
     response = work[size + 2 * width : size + 2 * width + pooled]
     read(points, start, count, 1, lanes, layer[: size - 1])
     fill(own, weights, car + width * size, lanes)
-    add(layer[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
+    tiles.add(layer[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
     for p in range(pooled):
         for n in range(lanes):
             best[p, n], chosen[p, n] = np.float32(0), np.float32(NOBODY)
@@ -173,10 +174,10 @@ def _encode(
         for j in range(width):
             for n in range(lanes):
                 hidden[j, n] = own[j, n]
-        add(x, weights, car, size, 1, size, width, hidden, lanes)
+        tiles.add(x, weights, car, size, 1, size, width, hidden, lanes)
         _activate(hidden, RELU, lanes)
         fill(response, weights, pair + pooled * width, lanes)
-        add(hidden, weights, pair, width, 1, width, pooled, response, lanes)
+        tiles.add(hidden, weights, pair, width, 1, width, pooled, response, lanes)
         number = np.float32(row)
         for p in range(pooled):
             for n in range(lanes):
@@ -232,7 +233,7 @@ def forward(
             inputs, outputs = widths[number], widths[number + 1]
             y = layers[row + inputs : row + inputs + outputs]
             fill(y, weights, at + outputs * inputs, lanes)
-            add(layers[row : row + inputs], weights, at, inputs, 1, inputs, outputs, y, lanes)
+            tiles.add(layers[row : row + inputs], weights, at, inputs, 1, inputs, outputs, y, lanes)
             _activate(y, kinds[number], lanes)
             at, row = at + outputs * (inputs + 1), row + inputs
         _answer(layers[row : row + widths[-1]], weights, at, form.last, start, count, out)
@@ -292,7 +293,7 @@ def backward(
             at -= outputs * (inputs + 1)
             activate_backward(layers[row : row + outputs], kinds[number], lanes, one)
             two[:inputs] = 0
-            add(one[:outputs], weights, at, 1, inputs, outputs, inputs, two[:inputs], lanes)
+            tiles.add(one[:outputs], weights, at, 1, inputs, outputs, inputs, two[:inputs], lanes)
             one, two = two, one
             row -= inputs
         if form.width:
@@ -370,7 +371,7 @@ def _encode_backward(
     by_response = work[at : at + pooled]
     read(points, start, count, 1, lanes, x[: size - 1])
     fill(own, weights, width * size, lanes)
-    add(x[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
+    tiles.add(x[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
     by_own[:] = 0
     for row in range(1, form.rows):
         read(points, start, count, row * size, lanes, x)
@@ -394,15 +395,15 @@ def _encode_backward(
         for j in range(width):
             for n in range(lanes):
                 hidden[j, n], by_hidden[j, n] = own[j, n], np.float32(0)
-        add(x, weights, 0, size, 1, size, width, hidden, lanes)
-        add(by_response, weights, pair, 1, width, pooled, width, by_hidden, lanes)
+        tiles.add(x, weights, 0, size, 1, size, width, hidden, lanes)
+        tiles.add(by_response, weights, pair, 1, width, pooled, width, by_hidden, lanes)
         for j in range(width):
             for n in range(lanes):
                 slope, before = by_hidden[j, n], hidden[j, n]
                 slope = slope if before > 0 else np.float32(0)
                 by_hidden[j, n] = slope
                 by_own[j, n] += slope
-        add(by_hidden, weights, 0, 1, size, width, size, by_x, lanes)
+        tiles.add(by_hidden, weights, 0, 1, size, width, size, by_x, lanes)
         for n in range(count):
             for k in range(size):
                 by_points[start + n, row * size + k] = by_x[k, n]
@@ -410,7 +411,7 @@ def _encode_backward(
     for k in range(size - 1):
         for n in range(lanes):
             by_ego[k, n] = by_layer[k, n]
-    add(by_own, weights, ego, 1, size - 1, width, size - 1, by_ego, lanes)
+    tiles.add(by_own, weights, ego, 1, size - 1, width, size - 1, by_ego, lanes)
     for n in range(count):
         by_points[start + n, 0] = np.float32(0)
         for k in range(size - 1):

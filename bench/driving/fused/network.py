@@ -22,7 +22,7 @@ ACTIVATIONS: dict[type[nn.Module] | None, int] = {
 
 MANY = 4096
 """Of more points than this a pass keeps nothing for the gradient. Only defences ask so many, and take the least of several
-answers: those that count are computed again."""
+answers: those that count are computed again. So they are where fewer than half of the answers count."""
 
 
 class Fused:
@@ -185,11 +185,12 @@ class _Pass(torch.autograd.Function):
     def backward(ctx: Any, by_answer: Tensor) -> tuple[Tensor, None]:
         points, network = ctx.kept[0], ctx.network
         by_out = by_answer.detach().reshape(len(points), network.outputs).contiguous()
-        if not ctx.lean:
+        asked = by_out.any(1).nonzero().squeeze(1)
+        # A second pass forward costs as much as one backward.
+        if not ctx.lean and 2 * len(asked) > len(points):
             by_points = np.empty_like(points)
             kernels.backward(*ctx.kept, by_out.numpy(), by_points)
             return torch.from_numpy(by_points).view(ctx.shape), None
-        asked = by_out.any(1).nonzero().squeeze(1)
         found = torch.zeros(points.shape)
         if len(asked):
             some = torch.from_numpy(points)[asked]
