@@ -96,10 +96,15 @@ def collide_with(road: Road, ego: Body, other: Body, parameters: Parameters, gri
         speed = parameters.target_speeds[index]
         if speed == other.speed:
             continue
+        closing = not_zero(speed - projected)
         for point in range(3):
             shift = 0.0 if point == 0 else (-MARGIN if point == 1 else MARGIN)
             cost = 1.0 if point == 0 else 0.5
-            time = (apart + shift) / not_zero(speed - projected)
+            gap = apart + shift
+            # The grid ends before these times, which need no division.
+            if gap * closing < 0 or abs(gap) > abs(closing) * parameters.period * (grid.shape[2] + 1):
+                continue
+            time = gap / closing
             if time < 0:
                 continue
             for rounded in (int(time / parameters.period), math.ceil(time / parameters.period)):
