@@ -56,7 +56,9 @@ def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `inner`, but compiled into each caller anew, which does not compute what it does not use."""
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", _nrt=False, forceinline=True)(function)
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", _nrt=False, forceinline=True)(
+        function
+    )
 
 
 def rounded_once(function: Callable[..., Any]) -> Callable[..., Any]:

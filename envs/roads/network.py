@@ -137,11 +137,11 @@ class LaneRecord:
     radius: float
     start_phase: float
     turn: float
-    inside: float  # m2, of a circular lane: bodies on it or within its margin are not nearer to the centre than its root
-    outside: float  # m2, nor farther away than its root
+    inside: float  # m2, square of the least distance from the centre of bodies on a circular lane or within its margin
+    outside: float  # m2, square of the largest one
     middle_x: float  # direction from the centre to the middle of the arc
     middle_y: float
-    least_x: float  # m along that direction, the same bodies are not farther back
+    least_x: float  # m along that direction, the least of the same bodies
     linked: int  # how many lanes are searched for its neighbours, itself included
 
 

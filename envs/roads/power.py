@@ -18,7 +18,7 @@ SMALLEST = 1e-20
 
 @borrowing
 def fourth_power(base: float) -> float:
-    """`base` ** 4 with the bits of the C library's `pow`: computed with twice the digits, unless it is close to a tie of rounding."""
+    """`base` ** 4 with the bits of the C library's `pow`, which is called only where twice the digits leave a doubt."""
     square = base * base
     square_error = fused(base, base, -square)
     fourth = square * square

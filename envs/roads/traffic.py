@@ -204,9 +204,7 @@ def choose_lane(road: Road, bodies: Bodies, number: int, free: float, leader: in
         if not 0 <= own.number + side < edge.lanes:
             continue
         lane = body.lane + side
-        if is_reachable(road, body, lane) and wants_lane(
-            road, bodies, number, lane, free, leader, parameters
-        ):
+        if is_reachable(road, body, lane) and wants_lane(road, bodies, number, lane, free, leader, parameters):
             body.target_lane = lane
 
 
