@@ -70,10 +70,13 @@ def neighbours_on_straight(lane: LaneRecord, bodies: Bodies, number: int) -> tup
         along = off_x * direction_x + off_y * direction_y
         across = off_x * -direction_y + off_y * direction_x
         there = (other != number) & (abs(across) <= reach) & (along >= -CAR_LENGTH) & (along < end)
-        ahead = there & (own <= along) & (along <= nearest)
-        front, nearest = other if ahead else front, along if ahead else nearest
-        behind = there & (along < own) & (along > last)
-        rear, last = other if behind else rear, along if behind else last
+        # What is not ahead is at inf: the next body waits only for the two lines below.
+        ahead = along if there & (own <= along) else np.inf
+        behind = along if there & (along < own) else -np.inf
+        front, nearest = other if ahead <= nearest else front, min(ahead, nearest)
+        rear, last = other if behind > last else rear, max(behind, last)
+    if nearest == np.inf:
+        front = NO_ONE
     return front, rear
 
 
