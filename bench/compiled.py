@@ -43,19 +43,21 @@ class _SourcesCache(FunctionCache):
 def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function that is called only from compiled code. No wrappers are built, which saves a third of the time.
 
-    A call from Python crashes the process; use `entry_point` for functions called from Python. As in numpy, a division by 0 gives
-    inf or nan: a test before each division would cost a tenth of the time.
+    A call from Python crashes the process; use `entry_point` for functions called from Python.
     """
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy")(function)
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
 def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `inner`, without counting references to arrays: for functions that make none, but only use those of their callers."""
+    """As `inner`, for functions that make no arrays, but only use those of their callers: references are not counted.
+
+    A division by 0 gives inf or nan, as in numpy.
+    """
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", _nrt=False)(function)
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `inner`, but compiled into each caller anew, which does not compute what it does not use."""
+    """As `borrowing`, but compiled into each caller anew, which does not compute what it does not use."""
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", _nrt=False, forceinline=True)(
         function
     )

@@ -92,7 +92,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=64)
     parser.add_argument("--envpool", metavar="PYTHON", help="a Python that has EnvPool")
     options = parser.parse_args()
-    console = Console()
+    console = Console(width=130)
     for task in options.tasks:
         share, rounds = options.seconds / options.rounds, range(options.rounds)
         rates = np.array(

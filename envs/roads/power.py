@@ -27,7 +27,7 @@ def fourth_power(base: float) -> float:
     low, high = fourth + (error - doubt), fourth + (error + doubt)
     if low == high and SMALLEST < fourth < 1 / SMALLEST:
         return low
-    return called(base, 4.0)  # type: ignore[no-any-return]
+    return called(base, 4.0)
 
 
 @borrowing
@@ -37,4 +37,4 @@ def power(base: float, exponent: float) -> float:
         return 1.0
     if exponent == 4.0:
         return fourth_power(base)
-    return called(base, exponent)  # type: ignore[no-any-return]
+    return called(base, exponent)

@@ -73,9 +73,9 @@ def test_no_body_on_a_lane_is_called_aside(task: str) -> None:
         aside, on = np.zeros(PLACES, np.bool_), np.zeros(PLACES, np.bool_)
         places(roads, number, x, y, aside, on)
         assert not (aside & on).any()
-        # Most of what is not on it is found without an angle.
+        # A bound that found nothing aside would prove nothing.
         assert on.any()
-        assert (aside | on).mean() > 0.9
+        assert aside[~on].mean() > 0.3
 
 
 def test_angles_that_are_cut_need_no_last_bits() -> None:
