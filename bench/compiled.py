@@ -11,7 +11,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from numba import njit
+from numba import njit, types
 from numba.core.caching import FunctionCache
 from numba.extending import intrinsic
 from numba.np.arrayobj import make_array
@@ -48,14 +48,34 @@ def inner(function: Callable[..., Any]) -> Callable[..., Any]:
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True)(function)
 
 
+def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """As `inner`, for functions that make no arrays, but only use those of their callers: references are not counted.
+
+    A division by 0 gives inf or nan, as in numpy.
+    """
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", _nrt=False)(function)
+
+
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """As `inner`, but compiled into each caller anew, which does not compute what it does not use."""
-    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, forceinline=True)(function)
+    """As `borrowing`, but compiled into each caller anew, which does not compute what it does not use."""
+    return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, error_model="numpy", _nrt=False, forceinline=True)(
+        function
+    )
 
 
 def rounded_once(function: Callable[..., Any]) -> Callable[..., Any]:
     """As `inner`; a product and the sum that it is added to are rounded once, where the processor can. Sums keep their order."""
     return njit(no_cpython_wrapper=True, no_cfunc_wrapper=True, fastmath={"contract"})(function)
+
+
+@intrinsic
+def fused(context: Any, first: Any, second: Any, third: Any) -> Any:
+    """In compiled code: `first` * `second` + `third`, rounded once."""
+
+    def build(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.fma(*arguments)
+
+    return types.float64(types.float64, types.float64, types.float64), build
 
 
 @intrinsic

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-from cavbench.compiled import inner
+from cavbench.compiled import borrowing
 from cavbench.envs.highway.collision import SURELY, polygons_intersect
 from cavbench.envs.roads.state import Bodies, Body, Floats, Kind
 
 OBSTACLE = int(Kind.OBSTACLE)
 
 
-@inner
+@borrowing
 def fill_corners(body: Body, corners: Floats) -> None:
     """RoadObject.polygon: write the rectangle's corners [5, 2], the first one again at the end."""
     cos, sin = body.cos_heading, body.sin_heading
@@ -22,7 +22,7 @@ def fill_corners(body: Body, corners: Floats) -> None:
         corners[corner, 1] = sin * along + cos * across + body.y
 
 
-@inner
+@borrowing
 def pass_side_by_side(first: Body, second: Body, displacement_x: float, displacement_y: float) -> bool:
     """Whether a line along the first body separates the two, now and within the frame.
 
@@ -36,13 +36,13 @@ def pass_side_by_side(first: Body, second: Body, displacement_x: float, displace
     return apart > reach + abs(normal_x * displacement_x + normal_y * displacement_y) + SURELY
 
 
-@inner
+@borrowing
 def set_impact(body: Body, push_x: float, push_y: float) -> None:
     """Set the impact; highway-env uses the last pair of a frame."""
     body.impact_x, body.impact_y, body.impact = push_x, push_y, True
 
 
-@inner
+@borrowing
 def collide(first: Body, second: Body, dt: float, corners: Floats) -> None:
     """RoadObject.handle_collisions for one pair, the first before the second in the list of cars.
 
@@ -71,7 +71,7 @@ def collide(first: Body, second: Body, dt: float, corners: Floats) -> None:
         second.crashed = True
 
 
-@inner
+@borrowing
 def find_collisions(bodies: Bodies, cars: int, dt: float, corners: Floats) -> None:
     """The second half of Road.step: test every pair in highway-env's order. `corners` [2, 5, 2] is a work array."""
     for number in range(cars):

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavbench.compiled import inner
+from cavbench.compiled import borrowing
 from cavbench.envs.highway.dynamics import not_zero
 from cavbench.envs.roads.lanes import SINE, STRAIGHT, local_coordinates, position
 from cavbench.envs.roads.state import Bodies, Body, Episode, Parameters, Road
@@ -24,7 +24,7 @@ SPEEDS = LANES = 3
 MARGIN = 5.0
 
 
-@inner
+@borrowing
 def mark(ego: Body, x: float, y: float, layer: NDArray[np.float32]) -> None:
     """Set the cell [12, 12] at a place relative to the ego in m, in the world's axes."""
     cos, sin = ego.cos_heading, ego.sin_heading
@@ -34,7 +34,7 @@ def mark(ego: Body, x: float, y: float, layer: NDArray[np.float32]) -> None:
         layer[int(row), int(column)] = 1.0
 
 
-@inner
+@borrowing
 def occupancy(road: Road, bodies: Bodies, episode: Episode, grid: NDArray[np.float32]) -> None:
     """Fill `grid` [24, 12]: twelve rows with cars, the ego's own cell included, then twelve rows with points of the lanes."""
     ego = bodies[episode.ego]
@@ -59,7 +59,7 @@ def occupancy(road: Road, bodies: Bodies, episode: Episode, grid: NDArray[np.flo
             mark(ego, x - ego.x, y - ego.y, grid[CELLS:])
 
 
-@inner
+@borrowing
 def is_connected(road: Road, ego: Body, other: Body) -> bool:
     """RoadNetwork.is_connected_road with a depth of 3: whether the other car is on a road that the ego will come to."""
     edge, goal = road.lanes[ego.lane].edge, road.lanes[other.lane].edge
@@ -82,7 +82,7 @@ def is_connected(road: Road, ego: Body, other: Body) -> bool:
             return road.reach[depth, edge, goal] > 0
 
 
-@inner
+@borrowing
 def collide_with(road: Road, ego: Body, other: Body, parameters: Parameters, grid: NDArray[np.float64]) -> None:
     """compute_ttc_grid for one other car; `grid` is [speeds, lanes, T]."""
     if not is_connected(road, ego, other):
@@ -96,10 +96,15 @@ def collide_with(road: Road, ego: Body, other: Body, parameters: Parameters, gri
         speed = parameters.target_speeds[index]
         if speed == other.speed:
             continue
+        closing = not_zero(speed - projected)
         for point in range(3):
             shift = 0.0 if point == 0 else (-MARGIN if point == 1 else MARGIN)
             cost = 1.0 if point == 0 else 0.5
-            time = (apart + shift) / not_zero(speed - projected)
+            gap = apart + shift
+            # The grid ends before these times, which need no division.
+            if gap * closing < 0 or abs(gap) > abs(closing) * parameters.period * (grid.shape[2] + 1):
+                continue
+            time = gap / closing
             if time < 0:
                 continue
             for rounded in (int(time / parameters.period), math.ceil(time / parameters.period)):
@@ -109,7 +114,7 @@ def collide_with(road: Road, ego: Body, other: Body, parameters: Parameters, gri
                             grid[index, number, rounded] = max(grid[index, number, rounded], cost)
 
 
-@inner
+@borrowing
 def times_to_collision(
     road: Road,
     bodies: Bodies,

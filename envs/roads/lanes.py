@@ -6,19 +6,16 @@ import math
 
 import numpy as np
 
-from cavbench.compiled import inlined, inner
-from cavbench.envs.roads.network import NEAR, LaneKind, LaneRecord
+from cavbench.compiled import borrowing, inlined
+from cavbench.envs.roads.network import CAR_LENGTH, NEAR, SURELY, LaneKind, LaneRecord
 from cavbench.envs.roads.state import Body, Road
 
 STRAIGHT, SINE, CIRCULAR = int(LaneKind.STRAIGHT), int(LaneKind.SINE), int(LaneKind.CIRCULAR)
-CAR_LENGTH = 5.0
-"""AbstractLane.VEHICLE_LENGTH in m."""
 TWO_PI = 2 * np.pi
-SURELY = 1e-6
-"""Margin in m, larger than any rounding error."""
+NO_LANE = -1
 
 
-@inner
+@borrowing
 def wrap_to_pi(angle: float) -> float:
     """highway_env.utils.wrap_to_pi: `angle` in [-pi, pi); the cases give the bits of the remainder without a division."""
     shifted = angle + np.pi
@@ -31,7 +28,7 @@ def wrap_to_pi(angle: float) -> float:
     return shifted % TWO_PI - np.pi
 
 
-@inner
+@borrowing
 def local_coordinates(lane: LaneRecord, x: float, y: float) -> tuple[float, float]:
     """AbstractLane.local_coordinates: m along the lane, and m to the right of its centre."""
     if lane.kind == CIRCULAR:
@@ -47,7 +44,7 @@ def local_coordinates(lane: LaneRecord, x: float, y: float) -> tuple[float, floa
     return along, across
 
 
-@inner
+@borrowing
 def position(lane: LaneRecord, along: float, across: float) -> tuple[float, float]:
     """AbstractLane.position: the point x, y."""
     if lane.kind == CIRCULAR:
@@ -60,7 +57,7 @@ def position(lane: LaneRecord, along: float, across: float) -> tuple[float, floa
     return x, lane.start_y + along * lane.direction_y + across * lane.direction_x
 
 
-@inner
+@borrowing
 def heading_at(lane: LaneRecord, along: float) -> float:
     """AbstractLane.heading_at in rad."""
     if lane.kind == CIRCULAR:
@@ -71,23 +68,44 @@ def heading_at(lane: LaneRecord, along: float) -> float:
     return lane.heading
 
 
-@inner
+@borrowing
 def is_on(lane: LaneRecord, along: float, across: float, margin: float) -> bool:
     """AbstractLane.on_lane: whether local coordinates are on the lane, widened by `margin` m on both sides."""
     near = abs(across) <= lane.width / 2 + margin
     return near and -CAR_LENGTH <= along < lane.length + CAR_LENGTH
 
 
-@inner
-def is_reachable(lane: LaneRecord, x: float, y: float) -> bool:
-    """AbstractLane.is_reachable_from: whether a lane change to the lane may start at a point."""
+@borrowing
+def coordinates_on_other(road: Road, body: Body, number: int) -> tuple[float, float]:
+    """The same on a lane that is not its own; until the body moves, those on one of them are stored."""
+    if number == body.other_lane:
+        return body.other_along, body.other_across
+    lane = road.lanes[number]
+    along, across = local_coordinates(lane, body.x, body.y)
+    if lane.kind != STRAIGHT:
+        body.other_lane, body.other_along, body.other_across = number, along, across
+    return along, across
+
+
+@inlined
+def coordinates_on(road: Road, body: Body, number: int) -> tuple[float, float]:
+    """Local coordinates of a body on a lane; on its own lane they are stored."""
+    if number == body.lane:
+        return body.along, body.across
+    return coordinates_on_other(road, body, number)
+
+
+@borrowing
+def is_reachable(road: Road, body: Body, number: int) -> bool:
+    """AbstractLane.is_reachable_from: whether a body may change to a lane."""
+    lane = road.lanes[number]
     if lane.forbidden:
         return False
-    along, across = local_coordinates(lane, x, y)
+    along, across = coordinates_on(road, body, number)
     return abs(across) <= 2 * lane.width and 0 <= along < lane.length + CAR_LENGTH
 
 
-@inner
+@borrowing
 def distance_to(lane: LaneRecord, x: float, y: float) -> float:
     """AbstractLane.distance: L1 distance in m of a point."""
     along, across = local_coordinates(lane, x, y)
@@ -121,7 +139,7 @@ def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least
     return apart + abs(wrap_to_pi(heading - heading_at(lane, along))), along, across
 
 
-@inner
+@borrowing
 def update_lane(body: Body, road: Road) -> None:
     """RoadNetwork.get_closest_lane_index: set the lane of a body and its place on it; the first lane wins a tie.
 
@@ -139,10 +157,11 @@ def update_lane(body: Body, road: Road) -> None:
             if apart < least or (apart == least and number < best):
                 best, least, along, across = number, apart, s, r
     body.lane, body.along, body.across = best, along, across
+    body.other_lane = NO_LANE
 
 
-@inner
-def is_after_end(lane: LaneRecord, x: float, y: float) -> bool:
-    """AbstractLane.after_end: whether a point is on the last half car length of the lane, or beyond."""
-    along, _ = local_coordinates(lane, x, y)
-    return along > lane.length - CAR_LENGTH / 2
+@inlined
+def is_after_end(road: Road, body: Body, number: int) -> bool:
+    """AbstractLane.after_end: whether a body is on the last half car length of a lane, or beyond."""
+    along, _ = coordinates_on(road, body, number)
+    return along > road.lanes[number].length - CAR_LENGTH / 2

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from cavbench.compiled import inner
+from cavbench.compiled import borrowing
 from cavbench.envs.highway.dynamics import (
     GAIN_HEADING,
     GAIN_LATERAL,
@@ -20,11 +20,11 @@ from cavbench.envs.highway.dynamics import (
 )
 from cavbench.envs.highway.ego import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER, nearest_target_speed
 from cavbench.envs.roads.lanes import (
+    coordinates_on,
     distance_to,
     heading_at,
     is_after_end,
     is_reachable,
-    local_coordinates,
     position,
     update_lane,
     wrap_to_pi,
@@ -34,24 +34,20 @@ from cavbench.envs.roads.state import Body, Parameters, Road
 
 PURSUIT = 0.5 * 0.2
 """ControlledVehicle.TAU_PURSUIT in s."""
+SURELY_STEEP = 0.708
+"""Above the sine of `MAX_LANE_CHANGE_HEADING`: such an angle is cut to that, whatever its last bits are."""
+SURELY_FULL = 0.66
+"""Above the sine of the slip angle at which the wheels turn by `MAX_STEERING`."""
 
 
-@inner
+@borrowing
 def update_direction(body: Body) -> None:
     """Update the stored cosine and sine of the heading."""
     body.cos_heading = math.cos(body.heading)
     body.sin_heading = math.sin(body.heading)
 
 
-@inner
-def coordinates_on(road: Road, body: Body, lane: int) -> tuple[float, float]:
-    """Local coordinates of a body on a lane; on its own lane they are stored."""
-    if lane == body.lane:
-        return body.along, body.across
-    return local_coordinates(road.lanes[lane], body.x, body.y)
-
-
-@inner
+@borrowing
 def lane_onto(road: Road, lane: LaneRecord, edge: int, wanted: int, x: float, y: float) -> tuple[int, float]:
     """RoadNetwork.next_lane_given_next_road: the lane on a road that follows `lane`, and its distance in m from a point."""
     after = road.edges[edge]
@@ -68,7 +64,7 @@ def lane_onto(road: Road, lane: LaneRecord, edge: int, wanted: int, x: float, y:
     return after.first + found, distance_to(road.lanes[after.first + found], x, y)
 
 
-@inner
+@borrowing
 def next_lane(road: Road, body: Body, current: int) -> int:
     """RoadNetwork.next_lane: along the route, otherwise onto the closest lane; the lane itself at a dead end."""
     lane = road.lanes[current]
@@ -80,7 +76,7 @@ def next_lane(road: Road, body: Body, current: int) -> int:
         following = road.routes[body.route, body.route_place]
         if following >= 0 and road.edges[following].start == node:
             edge, wanted = following, road.route_lanes[body.route, body.route_place]
-    along, _ = local_coordinates(lane, body.x, body.y)
+    along, _ = coordinates_on(road, body, current)
     x, y = position(lane, along, 0.0)
     if edge >= 0:
         return lane_onto(road, lane, edge, wanted, x, y)[0]
@@ -93,19 +89,14 @@ def next_lane(road: Road, body: Body, current: int) -> int:
     return found
 
 
-@inner
+@borrowing
 def follow_road(road: Road, body: Body) -> None:
     """ControlledVehicle.follow_road: at the end of the target lane, aim for the next one."""
-    lane = road.lanes[body.target_lane]
-    if body.target_lane == body.lane:
-        if body.along <= lane.length - 2.5:
-            return
-    elif not is_after_end(lane, body.x, body.y):
-        return
-    body.target_lane = next_lane(road, body, body.target_lane)
+    if is_after_end(road, body, body.target_lane):
+        body.target_lane = next_lane(road, body, body.target_lane)
 
 
-@inner
+@borrowing
 def steering_control(road: Road, body: Body, lane: int) -> float:
     """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of a lane."""
     along, across = coordinates_on(road, body, lane)
@@ -113,30 +104,35 @@ def steering_control(road: Road, body: Body, lane: int) -> float:
     if across == 0.0 and ahead == body.heading:
         return 0.0
     speed = not_zero(body.speed)
-    heading_command = math.asin(clip(-GAIN_LATERAL * across / speed, -1.0, 1.0))
-    heading_reference = ahead + clip(heading_command, -MAX_LANE_CHANGE_HEADING, MAX_LANE_CHANGE_HEADING)
+    share = -GAIN_LATERAL * across / speed
+    command = math.asin(share) if abs(share) < SURELY_STEEP else math.copysign(1.0, share)
+    heading_reference = ahead + clip(command, -MAX_LANE_CHANGE_HEADING, MAX_LANE_CHANGE_HEADING)
     heading_rate = GAIN_HEADING * wrap_to_pi(heading_reference - body.heading)
-    slip_angle = math.asin(clip(5.0 / 2 / speed * heading_rate, -1.0, 1.0))
-    return clip(math.atan(2 * math.tan(slip_angle)), -MAX_STEERING, MAX_STEERING)
+    slip = 5.0 / 2 / speed * heading_rate
+    if slip == 0.0:
+        return slip
+    if abs(slip) > SURELY_FULL:
+        return math.copysign(MAX_STEERING, slip)
+    return clip(math.atan(2 * math.tan(math.asin(slip))), -MAX_STEERING, MAX_STEERING)
 
 
-@inner
+@borrowing
 def speed_control(body: Body) -> float:
     """ControlledVehicle.speed_control: the acceleration in m/s2 towards the target speed."""
     return GAIN_SPEED * (body.target_speed - body.speed)
 
 
-@inner
+@borrowing
 def shift_lane(road: Road, body: Body, change: int) -> None:
     """ControlledVehicle.act: aim for the lane to the left (-1) or right (1) of the target lane, if it can be reached."""
     lane = road.lanes[body.target_lane]
     edge = road.edges[lane.edge]
     wanted = edge.first + min(max(lane.number + change, 0), edge.lanes - 1)
-    if is_reachable(road.lanes[wanted], body.x, body.y):
+    if is_reachable(road, body, wanted):
         body.target_lane = wanted
 
 
-@inner
+@borrowing
 def apply_meta_action(road: Road, body: Body, action: int, parameters: Parameters) -> None:
     """MDPVehicle.act: change the target speed or the target lane."""
     if action in (FASTER, SLOWER):
@@ -149,7 +145,7 @@ def apply_meta_action(road: Road, body: Body, action: int, parameters: Parameter
         shift_lane(road, body, 1 if action == LANE_RIGHT else -1)
 
 
-@inner
+@borrowing
 def clip_actions(body: Body) -> None:
     """Vehicle.clip_actions: a crashed car brakes to a stop, and no car drives faster than 40 m/s."""
     if body.crashed:
@@ -161,7 +157,7 @@ def clip_actions(body: Body) -> None:
         body.acceleration = max(body.acceleration, 1.0 * (-MAX_SPEED - body.speed))
 
 
-@inner
+@borrowing
 def move(road: Road, body: Body, dt: float) -> None:
     """Vehicle.step and IDMVehicle.step: one frame of the kinematic bicycle model, then an update of the car's lane."""
     body.timer += dt

@@ -22,6 +22,10 @@ WIDTH = 4.0
 """AbstractLane.DEFAULT_WIDTH in m."""
 MARGIN = 1.0
 """Road.neighbour_vehicles: up to so many m beside a lane, cars are neighbours on it."""
+CAR_LENGTH = 5.0
+"""AbstractLane.VEHICLE_LENGTH in m."""
+SURELY = 1e-6
+"""Margin in m, larger than any rounding error."""
 NEAR = 1.5
 """While a body's distance from its lane in m plus its angle in rad is at most this, only lanes in `ROAD.near` may be closer."""
 
@@ -133,6 +137,11 @@ class LaneRecord:
     radius: float
     start_phase: float
     turn: float
+    inside: float  # m2, square of the least distance from the centre of bodies on a circular lane or within its margin
+    outside: float  # m2, square of the largest one
+    middle_x: float  # direction from the centre to the middle of the arc
+    middle_y: float
+    least_x: float  # m along that direction, the least of the same bodies
     linked: int  # how many lanes are searched for its neighbours, itself included
 
 
@@ -265,6 +274,20 @@ def _fill(place: np.void, lane: Lane) -> None:
     place["start_x"], place["start_y"] = lane.start
     place["direction_x"], place["direction_y"] = lane.direction
     place["center_x"], place["center_y"] = lane.center
+    if lane.kind == LaneKind.CIRCULAR:
+        _fill_bounds(place, lane)
+
+
+def _fill_bounds(place: np.void, lane: Lane) -> None:
+    """Where bodies on a circular lane or within its margin may be; 1 um more than any rounding error."""
+    reach = lane.width / 2 + lane.margin + SURELY
+    nearest, farthest = max(lane.radius - reach, 0.0), lane.radius + reach
+    middle = lane.start_phase + lane.turn * lane.length / 2 / lane.radius
+    angle = (lane.length / 2 + CAR_LENGTH) / lane.radius
+    share = np.cos(max(angle, 0.0)) if angle < np.pi else -1.0
+    place["inside"], place["outside"] = nearest**2, farthest**2
+    place["middle_x"], place["middle_y"] = np.cos(middle), np.sin(middle)
+    place["least_x"] = min(nearest * share, farthest * share) - SURELY
 
 
 @dataclass(frozen=True, kw_only=True)

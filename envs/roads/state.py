@@ -70,6 +70,9 @@ class Body:
     along: float  # m on its lane
     across: float  # m to the right of its lane's centre
     lane: int  # the closest one
+    other_lane: int  # one of which the next two are stored until the body moves, or -1
+    other_along: float  # m on that lane
+    other_across: float  # m to the right of its centre
     speed: float  # m/s, signed
     cos_heading: float
     sin_heading: float

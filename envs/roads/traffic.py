@@ -6,16 +6,17 @@ import math
 
 import numpy as np
 
-from cavbench.compiled import inlined, inner
+from cavbench.compiled import borrowing, inlined
 from cavbench.envs.highway.dynamics import MAX_STEERING, clip, not_zero
 from cavbench.envs.highway.search import NO_ONE
 from cavbench.envs.highway.traffic import (
     LANE_CHANGE_DELAY,
     MAX_ACCELERATION,
 )
-from cavbench.envs.roads.lanes import CAR_LENGTH, CIRCULAR, STRAIGHT, is_on, is_reachable, local_coordinates
-from cavbench.envs.roads.motion import coordinates_on, follow_road, speed_control, steering_control
-from cavbench.envs.roads.network import LaneRecord
+from cavbench.envs.roads.lanes import CIRCULAR, STRAIGHT, coordinates_on, is_on, is_reachable
+from cavbench.envs.roads.motion import follow_road, speed_control, steering_control
+from cavbench.envs.roads.network import CAR_LENGTH, SURELY, LaneRecord
+from cavbench.envs.roads.power import power
 from cavbench.envs.roads.state import Bodies, Body, Kind, Parameters, Road
 
 TIME_GAP = 1.5
@@ -24,26 +25,25 @@ LANE_CHANGE_MAX_BRAKING_IMPOSED = 2.0
 DISCRETE, CONTINUOUS, IDM, OBSTACLE = int(Kind.DISCRETE), int(Kind.CONTINUOUS), int(Kind.IDM), int(Kind.OBSTACLE)
 
 
-@inner
+@borrowing
 def is_aside(lane: LaneRecord, x: float, y: float) -> bool:
     """Whether a point is surely not on a lane as wide as neighbours are looked for; without trigonometry."""
     if lane.kind == CIRCULAR:
         off_x, off_y = x - lane.center_x, y - lane.center_y
-        return abs(lane.radius - math.sqrt(off_x * off_x + off_y * off_y)) > lane.width / 2 + lane.margin + 1e-6
+        square = off_x * off_x + off_y * off_y
+        beside = (square < lane.inside) | (square > lane.outside)
+        return beside | (off_x * lane.middle_x + off_y * lane.middle_y < lane.least_x)
     across = (y - lane.start_y) * lane.direction_x - (x - lane.start_x) * lane.direction_y
-    return abs(across) - abs(lane.amplitude) > lane.width / 2 + lane.margin + 1e-6
+    return abs(across) - abs(lane.amplitude) > lane.width / 2 + lane.margin + SURELY
 
 
 @inlined
 def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
     """Whether a body is on a lane or within its margin, and where, in m."""
     lane = road.lanes[number]
-    if number == body.lane:
-        along, across = body.along, body.across
-    elif is_aside(lane, body.x, body.y):
+    if number != body.lane and is_aside(lane, body.x, body.y):
         return False, 0.0
-    else:
-        along, across = local_coordinates(lane, body.x, body.y)
+    along, across = coordinates_on(road, body, number)
     return is_on(lane, along, across, lane.margin), along
 
 
@@ -70,10 +70,13 @@ def neighbours_on_straight(lane: LaneRecord, bodies: Bodies, number: int) -> tup
         along = off_x * direction_x + off_y * direction_y
         across = off_x * -direction_y + off_y * direction_x
         there = (other != number) & (abs(across) <= reach) & (along >= -CAR_LENGTH) & (along < end)
-        ahead = there & (own <= along) & (along <= nearest)
-        front, nearest = other if ahead else front, along if ahead else nearest
-        behind = there & (along < own) & (along > last)
-        rear, last = other if behind else rear, along if behind else last
+        # What is not ahead is at inf: the next body waits only for the two lines below.
+        ahead = along if there & (own <= along) else np.inf
+        behind = along if there & (along < own) else -np.inf
+        front, nearest = other if ahead <= nearest else front, min(ahead, nearest)
+        rear, last = other if behind > last else rear, max(behind, last)
+    if nearest == np.inf:
+        front = NO_ONE
     return front, rear
 
 
@@ -102,14 +105,14 @@ def neighbours(road: Road, bodies: Bodies, number: int, lane: int) -> tuple[int,
     return front, rear
 
 
-@inner
+@borrowing
 def lane_distance(road: Road, body: Body, other: Body) -> float:
     """RoadObject.lane_distance_to in m, along the lane of `body`."""
     along, _ = coordinates_on(road, other, body.lane)
     return along - body.along
 
 
-@inner
+@borrowing
 def desired_gap(body: Body, leader: Body, parameters: Parameters) -> float:
     """IDMVehicle.desired_gap in m; the difference of velocities is projected onto the car's direction."""
     cos, sin = body.cos_heading, body.sin_heading
@@ -119,7 +122,7 @@ def desired_gap(body: Body, leader: Body, parameters: Parameters) -> float:
     return parameters.jam_distance + body.speed * TIME_GAP + body.speed * closing / parameters.gap_scale
 
 
-@inner
+@borrowing
 def free_acceleration(road: Road, body: Body, delta: float, parameters: Parameters) -> float:
     """IDMVehicle.acceleration on an empty road, in m/s2; a continuous ego has no target speed, so its target is 0."""
     target = 0.0 if body.kind == CONTINUOUS else body.target_speed
@@ -127,17 +130,17 @@ def free_acceleration(road: Road, body: Body, delta: float, parameters: Paramete
     if not math.isnan(limit):
         target = clip(target, 0.0, limit)
     share = max(body.speed, 0.0) / abs(not_zero(target))
-    return parameters.idm_acceleration * (1 - math.pow(share, delta))
+    return parameters.idm_acceleration * (1 - power(share, delta))
 
 
-@inner
+@borrowing
 def interaction(road: Road, body: Body, leader: Body, parameters: Parameters) -> float:
     """The term that IDMVehicle.acceleration subtracts for the body ahead, in m/s2."""
     ratio = desired_gap(body, leader, parameters) / not_zero(lane_distance(road, body, leader))
     return parameters.idm_acceleration * (ratio * ratio)
 
 
-@inner
+@borrowing
 def following(road: Road, bodies: Bodies, number: int, leader: int, free: float, parameters: Parameters) -> float:
     """IDMVehicle.acceleration behind `leader` (or NO_ONE), in m/s2, given its value `free` on an empty road."""
     if leader < 0:
@@ -145,7 +148,7 @@ def following(road: Road, bodies: Bodies, number: int, leader: int, free: float,
     return free - interaction(road, bodies[number], bodies[leader], parameters)
 
 
-@inner
+@borrowing
 def wants_lane(
     road: Road, bodies: Bodies, number: int, lane: int, free: float, own_leader: int, parameters: Parameters
 ) -> bool:
@@ -174,7 +177,7 @@ def wants_lane(
     return not braking < -LANE_CHANGE_MAX_BRAKING_IMPOSED
 
 
-@inner
+@borrowing
 def must_abort(road: Road, bodies: Bodies, number: int, cars: int, parameters: Parameters) -> bool:
     """Whether a car just ahead is already changing to the same lane (IDMVehicle.change_lane_policy)."""
     body = bodies[number]
@@ -191,7 +194,7 @@ def must_abort(road: Road, bodies: Bodies, number: int, cars: int, parameters: P
     return False
 
 
-@inner
+@borrowing
 def choose_lane(road: Road, bodies: Bodies, number: int, free: float, leader: int, parameters: Parameters) -> None:
     """The second half of IDMVehicle.change_lane_policy: test left, then right; right overwrites left."""
     body = bodies[number]
@@ -204,13 +207,11 @@ def choose_lane(road: Road, bodies: Bodies, number: int, free: float, leader: in
         if not 0 <= own.number + side < edge.lanes:
             continue
         lane = body.lane + side
-        if is_reachable(road.lanes[lane], body.x, body.y) and wants_lane(
-            road, bodies, number, lane, free, leader, parameters
-        ):
+        if is_reachable(road, body, lane) and wants_lane(road, bodies, number, lane, free, leader, parameters):
             body.target_lane = lane
 
 
-@inner
+@borrowing
 def drive_idm(road: Road, bodies: Bodies, number: int, cars: int, parameters: Parameters) -> None:
     """IDMVehicle.act: MOBIL for the lane, IDM for the acceleration (over both lanes during a change)."""
     body = bodies[number]
@@ -233,7 +234,7 @@ def drive_idm(road: Road, bodies: Bodies, number: int, cars: int, parameters: Pa
     body.acceleration = clip(acceleration, -MAX_ACCELERATION, MAX_ACCELERATION)
 
 
-@inner
+@borrowing
 def act(road: Road, bodies: Bodies, cars: int, parameters: Parameters) -> None:
     """Road.act: every car decides, in highway-env's order, because each uses the target lanes chosen before it."""
     for number in range(cars):
