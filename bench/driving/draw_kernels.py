@@ -91,8 +91,15 @@ def normal(numbers: NDArray[np.uint64], values: NDArray[Any]) -> None:
 
 
 @entry_point
-def numbered(keys: NDArray[np.uint64], counts: NDArray[np.uint64], copies: int, found: NDArray[np.uint64]) -> None:
-    """A number for each of some copies of each key, of which `counts` were made before; fills `found`, [copies, N]."""
-    for copy in range(copies):
-        for n in range(len(keys)):
-            found[copy, n] = mixed(mixed(keys[n] + (counts[n] + np.uint64(copy + 1)) * GOLDEN) + keys[n])
+def numbered(
+    keys: NDArray[np.uint64], counts: NDArray[np.uint64], rows: NDArray[np.int64], found: NDArray[np.uint64]
+) -> None:
+    """Fill `found`, [copies, R], with numbers for copies of the episodes `rows`, of which `counts` [B] were made before.
+
+    It counts them. A row that occurs several times gets a number for each time.
+    """
+    for copy in range(len(found)):
+        for n in range(len(rows)):
+            row = rows[n]
+            counts[row] += np.uint64(1)
+            found[copy, n] = mixed(mixed(keys[row] + counts[row] * GOLDEN) + keys[row])

@@ -2,7 +2,7 @@
 
 The run gives each observation a number: a function of its episode and of how often the victim was asked about that episode
 before. A policy that takes its noise from `noise` draws by these numbers. So units of a random victim can be driven in one
-batch, with the records that each has alone.
+batch, with the records that each has alone. Probes give numbers of their own: a victim cannot tell them from driving.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,7 +18,19 @@ from torch import Tensor
 
 from cavbench.driving import draw_kernels
 
-_GIVEN: ContextVar[Tensor | None] = ContextVar("given", default=None)
+CALL, LARGEST = 0xD1342543DE82EF95, 2**64 - 1
+"""What is added to the numbers for each further call of `noise` in an answer (the multiplier of Steele and Vigna 2022)."""
+
+
+@dataclass(eq=False)
+class Given:
+    """The numbers for an answer, int64 [N], and how often it has drawn by them."""
+
+    numbers: Tensor
+    calls: int = 0
+
+
+_GIVEN: ContextVar[Given | None] = ContextVar("given", default=None)
 
 
 class Draws:
@@ -33,23 +46,27 @@ class Draws:
 
     def numbers(self, rows: Tensor | None = None, copies: int = 1) -> Tensor:
         """New numbers, int64 [K * R], for K `copies` of all episodes or of `rows`, int64 [R], one copy after the other."""
-        places = slice(None) if rows is None else rows.numpy()
-        keys = self._keys[places]
-        found = np.empty((copies, len(keys)), np.uint64)
-        draw_kernels.numbered(keys, self._counts[places], copies, found)
-        self._counts[places] += np.uint64(copies)
+        places = np.arange(len(self._keys)) if rows is None else rows.numpy()
+        found = np.empty((copies, len(places)), np.uint64)
+        draw_kernels.numbered(self._keys, self._counts, places, found)
         return torch.from_numpy(found.view(np.int64)).flatten()
 
 
+def fresh(count: int) -> Tensor:
+    """Numbers of no episode, int64 [N], drawn from torch's generator."""
+    return torch.randint(-(2**63), 2**63 - 1, (count,))
+
+
 @contextmanager
-def given(numbers: Tensor | None) -> Iterator[None]:
+def given(numbers: Tensor | None) -> Iterator[Given | None]:
     """Ask a policy about N observations with a number for each, int64 [N]; None for the generator of the process."""
     if numbers is None:
-        yield
+        yield None
         return
-    token = _GIVEN.set(numbers)
+    found = Given(numbers)
+    token = _GIVEN.set(found)
     try:
-        yield
+        yield found
     finally:
         _GIVEN.reset(token)
 
@@ -57,12 +74,17 @@ def given(numbers: Tensor | None) -> Iterator[None]:
 def noise(like: Tensor) -> Tensor:
     """Standard normal noise for the measured values of observations `like` [..., V, F]: [..., V, F - 1].
 
-    It is a function of the numbers that the run gave these observations. Without a number for each, torch's generator draws.
+    It is a function of the numbers that the run gave these observations, and of how often this answer has drawn before. Without a
+    number for each observation, torch's generator draws.
     """
-    numbers, leading, size = _GIVEN.get(), like.shape[:-2], like.shape[-2:]
+    found, leading, size = _GIVEN.get(), like.shape[:-2], like.shape[-2:]
     wanted = size[0] * (size[1] - 1)
-    if numbers is None or len(numbers) != leading.numel():
+    if found is None or len(found.numbers) != leading.numel():
         return torch.randn_like(like[..., 1:])
+    numbers = found.numbers.numpy().view(np.uint64)
+    if found.calls:
+        numbers = numbers + np.uint64(found.calls * CALL & LARGEST)
+    found.calls += 1
     values = np.empty((len(numbers), wanted + wanted % 2), np.float32)
-    draw_kernels.normal(numbers.numpy().view(np.uint64), values)
+    draw_kernels.normal(numbers, values)
     return torch.from_numpy(values)[:, :wanted].reshape(*leading, size[0], size[1] - 1).to(like)

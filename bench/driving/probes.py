@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.driving.draws import fresh
 from cavbench.driving.policy import State, repeated, rows_of
 from cavbench.driving.shadows import REPEATS, ROUNDING, Shadow, differ, near
 from cavbench.driving.victim import CHUNK, CountedPolicy
@@ -182,9 +183,9 @@ class Probe:
 
         with self.stream.in_use():
             if question.path == "gradient":
-                self.subject.differentiated(question.points, question.state, loss)
+                self.subject.differentiated(question.points, question.state, loss, fresh(len(question.points)))
             else:
-                found.append(self.subject.answered(question.points, question.state))
+                found.append(self.subject.answered(question.points, question.state, fresh(len(question.points))))
         return found[0][question.place * len(question.rows) :][: len(question.rows)]
 
     def _compare(
@@ -197,7 +198,7 @@ class Probe:
         other = _apart(answer, driven) > tolerance
         if bool(other.any()):
             with self.stream.in_use():
-                again = [driven, *(self.subject.driven(shown, state)[0][rows] for _ in range(REPEATS))]
+                again = [driven, *(self._once(shown, state)[rows] for _ in range(REPEATS))]
             other &= differ([answer, *(self._answer(question) for _ in range(REPEATS - 1))], again, tolerance)
         if self.subject.action_type == "discrete":
             other |= driven.gather(-1, taken.unsqueeze(-1)).squeeze(-1) < driven.amax(-1)
@@ -216,7 +217,7 @@ class Probe:
         others = observation.clone()
         others[rows] = observation[rows].roll(len(rows) // 2, 0)
         with self.stream.in_use():
-            first, again = (self.subject.aside(observation, state)[rows], self._once(observation, state)[rows])
+            first, again = (self._aside(observation, state)[rows], self._once(observation, state)[rows])
             other = self._once(others, state)[rows]
         redrawn = (first != again).flatten(1).any(1)
         self.random = self.random or bool((_apart(first, again) > ROUNDING * first.abs().amax(-1)).any())
@@ -227,8 +228,11 @@ class Probe:
         self.same[places] += same.numpy()
         return bool(redrawn.any())
 
+    def _aside(self, observation: Tensor, state: State) -> Tensor:
+        return self.subject.aside(observation, state, fresh(len(observation)))
+
     def _once(self, observation: Tensor, state: State) -> Tensor:
-        return self.subject.driven(observation, state)[0]
+        return self.subject.driven(observation, state, fresh(len(observation)))[0]
 
     def count_draws(self, asked: Sequence[tuple[Tensor | None, Tensor]], running: Tensor) -> None:
         """Count how often an attack queried each distinct observation in a step.

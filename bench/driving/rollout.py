@@ -184,8 +184,6 @@ def _view(attack: DrivingAttack | None, td: TensorDictBase) -> View | None:
 
 def _check_actions(subject: CountedPolicy, observation: Tensor, state: State, facts: DrivingFacts) -> None:
     scores = subject.aside(observation, state)
-    if subject.draws:
-        subject.aside(observation, state, torch.arange(len(observation)))
     if subject.action_type == "discrete" and facts.actions:
         count = scores.shape[-1]
         if count != len(facts.actions):
@@ -202,14 +200,13 @@ def _check_rows(subject: CountedPolicy, observation: Tensor, state: State, gradi
 
     def answers(rows: Tensor) -> list[Tensor]:
         shown, own = observation[rows], rows_of(state, rows)
-        numbers = rows if subject.draws else None
-        scores = subject.aside(shown, own, numbers)
+        scores = subject.aside(shown, own, rows)
         if not gradients:
             return [scores]
-        found = [scores, _slope(subject, shown, own, numbers)]
+        found = [scores, _slope(subject, shown, own, rows)]
         if subject.action_type == "continuous":
             with suppress(NotImplementedError), Stream("aside").in_use():
-                value, slope = subject.valued(shown, scores, own, numbers)
+                value, slope = subject.valued(shown, scores, own, rows)
                 found += [value] if slope is None else [value, slope]
         return found
 
@@ -220,7 +217,7 @@ def _check_rows(subject: CountedPolicy, observation: Tensor, state: State, gradi
             raise NotJointError
 
 
-def _slope(subject: CountedPolicy, observation: Tensor, state: State, numbers: Tensor | None) -> Tensor:
+def _slope(subject: CountedPolicy, observation: Tensor, state: State, numbers: Tensor) -> Tensor:
     """[B, V, F] the gradient of the summed scores."""
     with Stream("aside").in_use():
         return subject.differentiated(observation, state, lambda scores: scores.sum(-1), numbers)[1]

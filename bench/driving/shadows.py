@@ -16,6 +16,7 @@ from itertools import combinations
 import torch
 from torch import Tensor
 
+from cavbench.driving.draws import fresh
 from cavbench.driving.policy import State, repeated, rows_of
 from cavbench.driving.victim import CountedPolicy
 from cavbench.isolation.streams import Stream
@@ -128,13 +129,14 @@ class Shadow:
         state = None if self._start is None else self._start.clone()
         with self.stream.in_use():
             for moment in self._moments[: steps - 1]:
-                self.subject.driven(moment.shown, state)
+                self.subject.driven(moment.shown, state, fresh(len(moment.shown)))
                 state = self.subject.advance(moment.shown, moment.action, state)
-            return self.subject.driven(self._moments[steps - 1].shown, state)[0][self.rows]
+            last = self._moments[steps - 1].shown
+            return self.subject.driven(last, state, fresh(len(last)))[0][self.rows]
 
     def _answered(self, points: Tensor, state: State) -> Tensor:
         with self.stream.in_use():
-            return self.subject.answered(points, state)
+            return self.subject.answered(points, state, fresh(len(points)))
 
     def _advanced(self, moment: _Moment, scores: Tensor, state: State) -> State:
         """The copies' state after a step: each took what was answered, those that are shown what was driven what was driven."""

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import torch
 from torch import Tensor
 
-from cavbench.driving.draws import Draws, given
+from cavbench.driving.draws import Draws, fresh, given
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import finite
 from cavbench.errors import UserError
@@ -54,8 +54,8 @@ class CountedPolicy:
         self._foreign = False
 
     def numbers(self, rows: Tensor | None = None, copies: int = 1) -> Tensor | None:
-        """Numbers for the draws of a call, as of `Draws.numbers`; None if the victim draws nothing, or by no numbers."""
-        return self._numbers.numbers(rows, copies) if self.draws and self._numbers else None
+        """Numbers for the draws of a call, as of `Draws.numbers`; None if the run has none."""
+        return self._numbers.numbers(rows, copies) if self._numbers else None
 
     @contextmanager
     def turn(self) -> Iterator[None]:
@@ -109,11 +109,13 @@ class CountedPolicy:
         """The scores [B, A], from random numbers of their own; notes in `draws` and `shares` whether they took any."""
         own = Stream("aside")
         with own.in_use():
+            if numbers is None and self._numbers is not None:
+                numbers = fresh(len(observation))
             before = own.marks()
             scores = self._scores(plain(observation), state, "while driving", numbers)
             drew = own.marks() != before
         self.draws |= drew
-        self.shares |= drew and (numbers is not None or self._numbers is None)
+        self.shares |= drew
         return scores
 
     def driven(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -196,8 +198,10 @@ class CountedPolicy:
             UserError: if they are NaN or infinite: no attack could choose such a point, so the victim would look robust.
         """
         self.evaluations += len(observation)
-        with given(numbers):
+        with given(numbers) as found:
             scores = self.policy.scores(observation, state)
+        if found is not None and found.calls:
+            self.draws = True
         if type(scores) is not Tensor:
             raise TamperError(f"the victim's scores are a {type(scores).__name__}, not a torch.Tensor", "defense")
         if not finite(scores) and not bool(scores.isfinite().all()):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from cavbench.core.pair import Pair, choose
 from cavbench.driving import Oracle, State
+from cavbench.driving.draws import noise
 from cavbench.driving.drive import _checked
 from cavbench.errors import UserError
 from cavbench.isolation.identifiers import opaque
@@ -54,6 +55,18 @@ class OfSmallBatches(Decoy):
 class OfAllOtherBatches(Decoy):
     def suspects(self, observation: Tensor) -> bool:
         return len(observation) != EPISODES
+
+
+class OfNumberedBatches(OfAllOtherBatches):
+    """It draws noise, and looks whether it was given a number for it, or the generator of the process drew."""
+
+    def forward(self, observation: Tensor) -> Tensor:
+        return super().forward(observation) + 1e-9 * noise(observation).mean((-1, -2)).unsqueeze(-1)
+
+    def suspects(self, observation: Tensor) -> bool:
+        before = torch.get_rng_state()
+        noise(observation)
+        return super().suspects(observation) and torch.equal(torch.get_rng_state(), before)
 
 
 class AfterSomeCalls(OfAllOtherBatches):
@@ -101,6 +114,7 @@ DECOYS = [
     OfLargeBatches,
     OfSmallBatches,
     OfAllOtherBatches,
+    OfNumberedBatches,
     AfterSomeCalls,
     AfterSomeTime,
     AlmostDeterministic,
@@ -144,6 +158,26 @@ def test_the_probed_steps_follow_from_a_seed_that_is_recorded() -> None:
     for name in ("redrawn", "same_answer", "inconsistent"):
         np.testing.assert_array_equal(first[name], again[name])
     assert np.array_equal(first["action_counts"], other["action_counts"])
+
+
+def test_what_a_victim_does_that_is_random_now_and_then_does_not_follow_from_the_probes() -> None:
+    def drawing() -> Victim:
+        start: list[Tensor] = []
+
+        class NotAtFirst(Victim):
+            def forward(self, observation: Tensor) -> Tensor:
+                start.extend([] if start else [observation.clone()])
+                if torch.equal(observation, start[0]):
+                    return super().forward(observation)
+                shift = torch.zeros_like(observation)
+                shift[..., 1:] = 0.3 * noise(observation)
+                return super().forward(observation + shift)
+
+        return NotAtFirst()
+
+    first, other = (drive(policy=drawing(), entropy=entropy) for entropy in (1, 2))
+    for name in ("return", "action_counts"):
+        np.testing.assert_array_equal(first[name], other[name])
 
 
 def test_a_policy_is_told_no_scenario_seed() -> None:

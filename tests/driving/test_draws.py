@@ -30,6 +30,24 @@ def test_no_number_is_given_twice() -> None:
     assert len(numbers.unique()) == len(numbers) == 400 * 8 + 5000 + 400
 
 
+def test_an_episode_that_is_asked_several_times_at_once_has_a_number_for_each() -> None:
+    draws, other = Draws(torch.tensor([5, 7])), Draws(torch.tensor([5, 7]))
+    numbers = draws.numbers(torch.tensor([0, 0, 0, 1]), 2)
+    assert len(numbers.unique()) == 8
+    assert torch.equal(numbers.view(2, 4)[:, :3].flatten(), other.numbers(torch.tensor([0]), 6))
+    assert torch.equal(draws.numbers()[:1], other.numbers()[:1])
+
+
+def test_two_draws_of_one_answer_are_not_the_same() -> None:
+    seen = torch.zeros(2000, 3, 3)
+    with given(Draws(torch.tensor([3])).numbers(copies=len(seen))) as found:
+        first, second = noise(seen), noise(seen)
+    assert found is not None
+    assert found.calls == 2
+    assert abs(float((first * second).mean())) < 4 / math.sqrt(first.numel())
+    assert abs(float(second.square().mean()) - 1) < 8 / math.sqrt(first.numel())
+
+
 def test_noise_is_normal() -> None:
     seen = torch.zeros(20_000, 3, 5)
     with given(Draws(torch.tensor([3])).numbers(copies=len(seen))):

@@ -88,6 +88,9 @@ class Fused:
         if places != [view.data_ptr() for view in _VIEWS.get(self, ())]:
             if any(weight.dtype != torch.float32 or weight.device.type != "cpu" for weight in weights):
                 return False
+            # 0 times infinity is NaN in torch, and left out here.
+            if not all(bool(weight.isfinite().all()) for weight in weights):
+                return False
             _VIEWS[self] = [weight.detach().reshape(-1) for weight in weights]
         return True
 

@@ -100,6 +100,13 @@ def test_a_nan_or_infinity_is_not_lost(policy: Policy) -> None:
     assert bool(scores[[0, 2]].isfinite().all())
 
 
+def test_a_network_with_an_infinite_weight_answers_as_torch_does(policy: Policy) -> None:
+    other, x = copy.deepcopy(policy), observation((20,))
+    next(iter(other.parameters())).data.flatten()[0] = torch.inf
+    whole = other.scores(x)
+    torch.testing.assert_close(whole, by_torch(lambda: other.scores(x)), rtol=0, atol=0, equal_nan=True)
+
+
 def test_a_changed_weight_counts_in_the_next_call(policy: Policy) -> None:
     x = observation((20,))
     before = policy.scores(x)
