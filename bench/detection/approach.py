@@ -22,7 +22,7 @@ from cavbench.detection.patch import Patch
 from cavbench.detection.printing import non_printability
 from cavbench.detection.scenes import Approach, Scenes
 from cavbench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys, look_at_faces
-from cavbench.isolation.streams import Stream
+from cavbench.isolation.streams import put_back
 
 Columns = dict[str, NDArray[np.generic]]
 
@@ -238,7 +238,7 @@ def probed(
         boxes = box.to(output.boxes).expand(len(pictures), 4)
         return float(confidence(output, label, boxes, iou=SAME_IOU)[at].detach())
 
-    with Stream("probe", entropy).in_use():
+    with put_back():
         first, again = ask(image), ask(image)
         grey = ask(torch.full_like(image, 0.5))
         # A random detector must not look like a decoy.

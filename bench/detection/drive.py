@@ -101,12 +101,12 @@ def _carried_out(jobs: Sequence[Job], artefacts: Mapping[str, bytes], traced: Se
         approaches = mounted(approaches, pair.threat.mount)
         detector = placed(pair.load(first.training_seed), first.device)
     with Watch(detector, "detector", "defense", listens=False):
-        with Stream("unpatched", first.attack_seed).in_use():
+        with Stream("victim", first.attack_seed).in_use():
             unpatched = Unpatched.of(detector, approaches, pair.threat.budget)
         for job, own in zip(jobs, patches, strict=True):
             share_done(len(found) / len(jobs))
-            # A random detector draws the same whatever patches it saw before.
-            with Stream("look", job.attack_seed).in_use():
+            # A random detector draws the same whatever patches it saw before. Its seed is that of crafting: it tells nothing.
+            with Stream("victim", job.attack_seed).in_use():
                 if len(own) == 1:
                     found.append(_scored(job, detector, approaches, own[0], unpatched, traced))
                 else:

@@ -52,9 +52,9 @@ class Draws:
         return torch.from_numpy(found.view(np.int64)).flatten()
 
 
-def fresh(count: int) -> Tensor:
-    """Numbers of no episode, int64 [N], drawn from torch's generator."""
-    return torch.randint(-(2**63), 2**63 - 1, (count,))
+def fresh(count: int, generator: torch.Generator) -> Tensor:
+    """Numbers of no episode, int64 [N]."""
+    return torch.randint(-(2**63), 2**63 - 1, (count,), generator=generator)
 
 
 @contextmanager

@@ -7,7 +7,8 @@ The leaderboard's flags use the results.
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +20,6 @@ from cavbench.driving.draws import fresh
 from cavbench.driving.policy import State, repeated, rows_of
 from cavbench.driving.shadows import REPEATS, ROUNDING, Shadow, differ, near
 from cavbench.driving.victim import CHUNK, CountedPolicy
-from cavbench.isolation.streams import Stream
 
 EVERY = 15
 """Mean number of steps between two probes: a second of driving."""
@@ -37,6 +37,8 @@ SHADOWS_IF_REHEARSED = 0.5
 SHORT, LONG = 4, 64
 """Most steps of a shadow; every second one may be long under an attack that may rehearse."""
 MOST_COPIES = 12
+EARLIER = (0, 0, 1, 2)
+"""How many questions may come before the one that is compared."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class _Question:
         place: which of the K copies of each episode is the observation that it is driven with; others are near it.
         points: [K * R, V, F].
         state: the victim's state of each point.
+        earlier: how often the same is asked before, without a look at the answer: an attack asks often in a step.
     """
 
     path: str
@@ -56,6 +59,7 @@ class _Question:
     place: int
     points: Tensor
     state: State
+    earlier: int
 
 
 class Probe:
@@ -71,9 +75,9 @@ class Probe:
     def __init__(self, batch: int, subject: CountedPolicy, entropy: int, rehearsed: bool = False) -> None:
         self.subject, self.entropy, self.rehearsed = subject, entropy, rehearsed
         self.chance = random.Random(entropy)
-        self.stream = Stream("probe", entropy)
-        # Shadows change nothing in the order of the questions.
-        self.shadows = random.Random(~entropy)
+        # Shadows and random numbers change nothing in the order of the questions.
+        self.shadows, self.looks = random.Random(~entropy), random.Random(f"looks {entropy}")
+        self.numbers = torch.Generator().manual_seed(self.looks.getrandbits(62))
         self.redrawn, self.same, self.probed = (np.zeros(batch) for _ in range(3))
         self.otherwise, self.compared = np.zeros(batch), np.zeros(batch)
         self.draws, self.drawn = np.zeros(batch), np.zeros(batch)
@@ -103,27 +107,45 @@ class Probe:
             state: the victim's state.
             asked: the attack's queries of this step, as in `count_draws`; None if no probe is due.
             rehearsal: the copies and the episodes, by index among the running ones, of the attack's last rehearsal.
-            numbers: for the draws of the step, int64 [B]; probes draw from their own stream.
+            numbers: for the draws of the step, int64 [B]; probes have their own.
         """
         due = asked is not None
         if due and self.shadow is None:
             self.shadow = self._begun(running, state, rehearsal)
-        before = self._ask(shown, running, state) if due and self.chance.random() < 0.5 else None
+        before = None
         first = self.shadows.random() < 0.5
-        if self.shadow and first:
-            self.shadow.ask(shown)
-        scores, action = self.subject.driven(shown, state, numbers)
-        if due:
-            question, answer = before or self._ask(shown, running, state)
-            if len(question.rows):
-                self._compare(shown, scores, action, question, answer, state)
-        if self.shadow:
-            if not first:
+        with self._unseen():
+            if due and self.chance.random() < 0.5:
+                before = self._ask(shown, running, state)
+            if self.shadow and first:
                 self.shadow.ask(shown)
-            self._follow(self.shadow, shown, running, scores, action)
-        if asked is not None and self._look(truth, running, state) and asked:
-            self.count_draws(asked, running)
+        scores, action = self.subject.driven(shown, state, numbers)
+        with self._unseen():
+            if due:
+                question, answer = before or self._ask(shown, running, state)
+                if len(question.rows):
+                    self._compare(shown, scores, action, question, answer, state)
+            if self.shadow:
+                if not first:
+                    self.shadow.ask(shown)
+                self._follow(self.shadow, shown, running, scores, action)
+            if asked is not None and self._look(truth, running, state) and asked:
+                self.count_draws(asked, running)
         return scores, action
+
+    @contextmanager
+    def _unseen(self) -> Iterator[None]:
+        """Probe with the random numbers of the run, which are put back.
+
+        An attack may draw between its queries: so does the probe, or not.
+        """
+        with self.subject.unseen():
+            if not self.subject.shares:
+                with self.subject.as_asked():
+                    for draw in (torch.rand, np.random.random, lambda count: [random.random() for _ in range(count)]):
+                        if self.looks.random() < 0.5:
+                            draw(self.looks.randint(1, 64))
+            yield
 
     def _begun(self, running: Tensor, state: State, rehearsal: tuple[int, Tensor | None] | None) -> Shadow | None:
         """A shadow that begins at this step; None for none."""
@@ -142,7 +164,7 @@ class Probe:
             rows = rows if chosen is None else rows[chosen[chosen < len(rows)]]
         else:
             copies, rows = self.shadows.randint(1, MOST_COPIES), _some(rows, self.shadows)
-        return Shadow(self.subject, self.stream, self.shadows, state, rows, copies, steps) if len(rows) else None
+        return Shadow(self.subject, self.shadows, state, rows, copies, steps) if len(rows) else None
 
     def _follow(self, shadow: Shadow, shown: Tensor, running: Tensor, scores: Tensor, action: Tensor) -> None:
         """Take a shadow one step on."""
@@ -157,7 +179,8 @@ class Probe:
             return
         places = shadow.rows.numpy()
         self.compared[places] += 1
-        self.otherwise[places] += shadow.otherwise().numpy()
+        with self._unseen():
+            self.otherwise[places] += shadow.otherwise().numpy()
 
     def _ask(self, observation: Tensor, running: Tensor, state: State) -> tuple[_Question, Tensor]:
         """Ask about some running episodes along one of the oracle's paths."""
@@ -168,7 +191,8 @@ class Probe:
         place = self.chance.randrange(copies)
         noise = torch.Generator().manual_seed(self.chance.getrandbits(62))
         points = near(observation[rows], copies, place, NEAR, noise)
-        question = _Question(path, rows, place, points, repeated(rows_of(state, rows), torch.Size([copies])))
+        earlier = self.looks.choice(EARLIER)
+        question = _Question(path, rows, place, points, repeated(rows_of(state, rows), torch.Size([copies])), earlier)
         return question, self._answer(question)
 
     def _answer(self, question: _Question) -> Tensor:
@@ -176,16 +200,20 @@ class Probe:
         if not len(question.rows):
             return question.points
         found: list[Tensor] = []
+        with self.subject.as_asked():
+            for _ in range(question.earlier):
+                self.subject.answered(question.points, question.state, fresh(len(question.points), self.numbers))
 
         def loss(scores: Tensor) -> Tensor:
             found.append(scores.detach())
             return scores.sum(-1)
 
-        with self.stream.in_use():
+        numbers = fresh(len(question.points), self.numbers)
+        with self.subject.as_asked():
             if question.path == "gradient":
-                self.subject.differentiated(question.points, question.state, loss, fresh(len(question.points)))
+                self.subject.differentiated(question.points, question.state, loss, numbers)
             else:
-                found.append(self.subject.answered(question.points, question.state, fresh(len(question.points))))
+                found.append(self.subject.answered(question.points, question.state, numbers))
         return found[0][question.place * len(question.rows) :][: len(question.rows)]
 
     def _compare(
@@ -197,9 +225,12 @@ class Probe:
         tolerance = ROUNDING * driven.abs().amax(-1).clamp(min=1e-3)
         other = _apart(answer, driven) > tolerance
         if bool(other.any()):
-            with self.stream.in_use():
-                again = [driven, *(self._once(shown, state)[rows] for _ in range(REPEATS))]
-            other &= differ([answer, *(self._answer(question) for _ in range(REPEATS - 1))], again, tolerance)
+            # By turns, as in a run: a decoy may look at what was asked last.
+            answers, again = [answer], [driven, self._once(shown, state)[rows]]
+            for _ in range(REPEATS - 1):
+                answers.append(self._answer(question))
+                again.append(self._once(shown, state)[rows])
+            other &= differ(answers, again, tolerance)
         if self.subject.action_type == "discrete":
             other |= driven.gather(-1, taken.unsqueeze(-1)).squeeze(-1) < driven.amax(-1)
         else:
@@ -216,9 +247,8 @@ class Probe:
             return False
         others = observation.clone()
         others[rows] = observation[rows].roll(len(rows) // 2, 0)
-        with self.stream.in_use():
-            first, again = (self._aside(observation, state)[rows], self._once(observation, state)[rows])
-            other = self._once(others, state)[rows]
+        first = self.subject.noticed(observation, state, fresh(len(observation), self.numbers))[rows]
+        again, other = (self._once(points, state)[rows] for points in (observation, others))
         redrawn = (first != again).flatten(1).any(1)
         self.random = self.random or bool((_apart(first, again) > ROUNDING * first.abs().amax(-1)).any())
         same = ((first - other).abs() <= SAME).flatten(1).all(1)
@@ -228,11 +258,8 @@ class Probe:
         self.same[places] += same.numpy()
         return bool(redrawn.any())
 
-    def _aside(self, observation: Tensor, state: State) -> Tensor:
-        return self.subject.aside(observation, state, fresh(len(observation)))
-
     def _once(self, observation: Tensor, state: State) -> Tensor:
-        return self.subject.driven(observation, state, fresh(len(observation)))[0]
+        return self.subject.driven(observation, state, fresh(len(observation), self.numbers))[0]
 
     def count_draws(self, asked: Sequence[tuple[Tensor | None, Tensor]], running: Tensor) -> None:
         """Count how often an attack queried each distinct observation in a step.

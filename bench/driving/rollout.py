@@ -205,7 +205,7 @@ def _check_rows(subject: CountedPolicy, observation: Tensor, state: State, gradi
             return [scores]
         found = [scores, _slope(subject, shown, own, rows)]
         if subject.action_type == "continuous":
-            with suppress(NotImplementedError), Stream("aside").in_use():
+            with suppress(NotImplementedError), subject.unseen():
                 value, slope = subject.valued(shown, scores, own, rows)
                 found += [value] if slope is None else [value, slope]
         return found
@@ -219,7 +219,7 @@ def _check_rows(subject: CountedPolicy, observation: Tensor, state: State, gradi
 
 def _slope(subject: CountedPolicy, observation: Tensor, state: State, numbers: Tensor) -> Tensor:
     """[B, V, F] the gradient of the summed scores."""
-    with Stream("aside").in_use():
+    with subject.unseen():
         return subject.differentiated(observation, state, lambda scores: scores.sum(-1), numbers)[1]
 
 

@@ -19,7 +19,6 @@ from torch import Tensor
 from cavbench.driving.draws import fresh
 from cavbench.driving.policy import State, repeated, rows_of
 from cavbench.driving.victim import CountedPolicy
-from cavbench.isolation.streams import Stream
 
 ROUNDING = 1e-3
 """Scores may differ by this share of their largest value between batches of different sizes."""
@@ -47,7 +46,6 @@ class Shadow:
 
     Args:
         subject: the victim.
-        stream: random numbers of the probes.
         chance: makes the choices that nobody can foresee.
         state: the victim's state of all B episodes at the first step.
         rows: int64 [R], the episodes.
@@ -58,14 +56,13 @@ class Shadow:
     def __init__(
         self,
         subject: CountedPolicy,
-        stream: Stream,
         chance: random.Random,
         state: State,
         rows: Tensor,
         copies: int,
         steps: int,
     ) -> None:
-        self.subject, self.stream, self.rows, self.copies, self.steps = subject, stream, rows, copies, steps
+        self.subject, self.rows, self.copies, self.steps = subject, rows, copies, steps
         place = chance.randrange(copies)
         self._own = slice(place * len(rows), (place + 1) * len(rows))
         self._place, self._at_once = place, chance.random() < 0.5
@@ -111,8 +108,10 @@ class Shadow:
             return apart.any(0)
         # What differs first is asked again: a random victim goes other ways from there on.
         step = int(apart.any(1).nonzero()[0])
-        others = [answers[step], *(self._simulated(step + 1)[step] for _ in range(REPEATS - 1))]
-        again = [driven[step], *(self._driven_again(step + 1) for _ in range(REPEATS))]
+        others, again = [answers[step]], [driven[step], self._driven_again(step + 1)]
+        for _ in range(REPEATS - 1):
+            others.append(self._simulated(step + 1)[step])
+            again.append(self._driven_again(step + 1))
         return apart[step] & differ(others, again, tolerance[step])
 
     def _simulated(self, steps: int) -> list[Tensor]:
@@ -127,20 +126,22 @@ class Shadow:
     def _driven_again(self, steps: int) -> Tensor:
         """[R, A] the scores of the last of the first steps, driven again in the batch of all episodes."""
         state = None if self._start is None else self._start.clone()
-        with self.stream.in_use():
-            for moment in self._moments[: steps - 1]:
-                self.subject.driven(moment.shown, state, fresh(len(moment.shown)))
-                state = self.subject.advance(moment.shown, moment.action, state)
-            last = self._moments[steps - 1].shown
-            return self.subject.driven(last, state, fresh(len(last)))[0][self.rows]
+        for moment in self._moments[: steps - 1]:
+            self.subject.driven(moment.shown, state, self._numbers(moment.shown))
+            state = self.subject.advance(moment.shown, moment.action, state)
+        last = self._moments[steps - 1].shown
+        return self.subject.driven(last, state, self._numbers(last))[0][self.rows]
 
     def _answered(self, points: Tensor, state: State) -> Tensor:
-        with self.stream.in_use():
-            return self.subject.answered(points, state, fresh(len(points)))
+        with self.subject.as_asked():
+            return self.subject.answered(points, state, self._numbers(points))
+
+    def _numbers(self, points: Tensor) -> Tensor:
+        return fresh(len(points), self._noise)
 
     def _advanced(self, moment: _Moment, scores: Tensor, state: State) -> State:
         """The copies' state after a step: each took what was answered, those that are shown what was driven what was driven."""
-        with self.stream.in_use():
+        with self.subject.as_asked():
             action = self.subject.policy.choose(scores).clone()
             action[self._own] = moment.action[self.rows]
             return self.subject.advance(moment.points, action, state)

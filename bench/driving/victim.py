@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from cavbench.driving.draws import Draws, fresh, given
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import finite
 from cavbench.errors import UserError
-from cavbench.isolation.streams import Stream
+from cavbench.isolation.streams import Stream, put_back
 from cavbench.isolation.watch import Side, TamperError, Watch
 
 CHUNK = 1024
@@ -86,6 +86,21 @@ class CountedPolicy:
         finally:
             self._switch(before, self.stream if self.shares else None)
 
+    @contextmanager
+    def unseen(self) -> Iterator[None]:
+        """Ask as a run asks while it drives, and leave no trace: what is drawn in here, from whatever stream, is put back.
+
+        The victim meets the states of the random generators that it meets while it drives: it cannot tell a probe by them.
+        """
+        with put_back(), nullcontext() if self.stream is None else self.stream.put_back():
+            yield
+
+    @contextmanager
+    def as_asked(self) -> Iterator[None]:
+        """Ask as an attack's query asks: the victim meets the same states of the random generators as in `asked`."""
+        with nullcontext() if self.stream is None or self.shares else self.stream.in_use():
+            yield
+
     def _switch(self, foreign: bool, stream: Stream | None) -> None:
         self._foreign = foreign
         if self.watch is not None:
@@ -106,14 +121,17 @@ class CountedPolicy:
         return None if after is None else after.clone()
 
     def aside(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
-        """The scores [B, A], from random numbers of their own; notes in `draws` and `shares` whether they took any."""
-        own = Stream("aside")
-        with own.in_use():
-            if numbers is None and self._numbers is not None:
-                numbers = fresh(len(observation))
-            before = own.marks()
-            scores = self._scores(plain(observation), state, "while driving", numbers)
-            drew = own.marks() != before
+        """The scores [B, A], as in `noticed`, and what is drawn is put back."""
+        if numbers is None and self._numbers is not None:
+            numbers = fresh(len(observation), torch.Generator().manual_seed(0))
+        with self.unseen():
+            return self.noticed(observation, state, numbers)
+
+    def noticed(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
+        """The scores [B, A]; notes in `draws` and `shares` whether random numbers of the process were drawn for them."""
+        before = Stream.marks()
+        scores = self._scores(plain(observation), state, "while driving", numbers)
+        drew = Stream.marks() != before
         self.draws |= drew
         self.shares |= drew
         return scores

@@ -29,6 +29,17 @@ class Stream:
         self._gpu = torch.Generator("cuda").manual_seed(number).get_state() if torch.cuda.is_initialized() else None
         self._fresh = _bytes(self._torch), self._python, _drawn(self._numpy), _bytes(self._gpu)
 
+    @contextmanager
+    def put_back(self) -> Iterator[None]:
+        """What is drawn from it in here is drawn again afterwards; begin and end while it is not in use."""
+        kept = self._torch, self._python, self._numpy, self._gpu
+        state = self._numpy.state
+        try:
+            yield
+        finally:
+            self._torch, self._python, self._numpy, self._gpu = kept
+            self._numpy.state = state
+
     def used(self) -> bool:
         """Whether anything was drawn from it, or it was seeded, since it was made; ask while it is not in use."""
         with self.in_use():
@@ -56,10 +67,28 @@ class Stream:
         finally:
             self.swap()
 
-    def marks(self) -> tuple[bytes, object, bytes, bytes]:
+    @staticmethod
+    def marks() -> tuple[bytes, object, bytes, bytes]:
         """What tells whether anything was drawn from the global generators."""
         gpu = torch.cuda.get_rng_state() if torch.cuda.is_initialized() else None
         return _bytes(torch.get_rng_state()), random.getstate(), _drawn(mtrand.get_bit_generator()), _bytes(gpu)
+
+
+@contextmanager
+def put_back() -> Iterator[None]:
+    """What is drawn from the global generators in here is drawn again afterwards."""
+    gpu = torch.cuda.get_rng_state() if torch.cuda.is_initialized() else None
+    kept, numpy = (torch.get_rng_state(), random.getstate()), mtrand.get_bit_generator()
+    state = numpy.state
+    try:
+        yield
+    finally:
+        torch.set_rng_state(kept[0])
+        random.setstate(kept[1])
+        numpy.state = state
+        mtrand.set_bit_generator(numpy)
+        if gpu is not None:
+            torch.cuda.set_rng_state(gpu)
 
 
 def _bytes(state: torch.Tensor | None) -> bytes:

@@ -111,7 +111,17 @@ class OfOddBatches(Decoy):
         return len(pictures) % 2 == 1
 
 
-@pytest.mark.parametrize("decoy", [WithGradients, OfGraphs, OfSeveral, OfOddBatches])
+class OfTheSameSeed(WithGradients):
+    """It takes what asks with random numbers of another seed than its first image for a probe."""
+
+    seed: int | None = None
+
+    def suspects(self, pictures: Tensor) -> bool:
+        self.seed = self.seed or torch.initial_seed()
+        return super().suspects(pictures) and torch.initial_seed() == self.seed
+
+
+@pytest.mark.parametrize("decoy", [WithGradients, OfGraphs, OfSeveral, OfOddBatches, OfTheSameSeed])
 def test_a_detector_that_answers_attacks_otherwise_is_flagged(decoy: type[RedDetector]) -> None:
     flagged = [inconsistent(decoy(), entropy) for entropy in range(12)]
     assert np.mean(flagged) > 0.5

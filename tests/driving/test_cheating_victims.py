@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import random
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 import torch
+from numpy.random import mtrand
 from torch import Tensor
 
 from cavbench.core.pair import Pair, choose
@@ -120,6 +123,56 @@ DECOYS = [
     AlmostDeterministic,
     Chooses,
 ]
+
+
+def of_torch() -> object:
+    return bytes(torch.get_rng_state().numpy())
+
+
+def of_numpy() -> object:
+    return repr(np.random.get_state(legacy=False)["state"])  # noqa: NPY002
+
+
+def which_numpy() -> object:
+    return id(mtrand.get_bit_generator())
+
+
+LOOKS = [torch.initial_seed, of_torch, random.getstate, of_numpy, which_numpy]
+
+
+class ByGenerators(Decoy):
+    """Lies to questions, if the random generators look the same, or if they look otherwise, than at its last answer."""
+
+    def __init__(self, look: Callable[[], object], same: bool, draws: bool) -> None:
+        super().__init__()
+        self.look, self.same, self.draws = look, same, draws
+        self.seen: object = None
+        self.lies = 0
+
+    def suspects(self, observation: Tensor) -> bool:
+        lies = len(observation) != EPISODES and (self.look() == self.seen) == self.same
+        self.lies += lies
+        if self.draws:
+            torch.rand(1), np.random.random(), random.random()  # noqa: NPY002
+        if not self.draws or len(observation) == EPISODES:
+            self.seen = self.look()
+        return lies
+
+
+@pytest.mark.parametrize("look", LOOKS)
+@pytest.mark.parametrize("same", [True, False])
+@pytest.mark.parametrize("draws", [True, False])
+def test_a_decoy_that_looks_at_random_generators_is_flagged(
+    look: Callable[[], object], same: bool, draws: bool
+) -> None:
+    def ask(observation: Tensor, oracle: Oracle) -> None:
+        for _ in range(2):
+            oracle.scores(observation.expand(3, *observation.shape))
+
+    victim = ByGenerators(look, same, draws)
+    flagged = [np.nanmean(drive(ask, victim, entropy=entropy, queries=1000)["inconsistent"]) for entropy in (0, 1)]
+    # One that draws sees the same seed, or the same generator, in all questions: it has nobody to lie to, or lies to all.
+    assert victim.lies == 0 or np.mean(flagged) >= 0.05
 
 
 @pytest.mark.parametrize("cheat", DECOYS)
