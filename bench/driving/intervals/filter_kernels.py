@@ -185,7 +185,6 @@ def weigh(
     shown: Floats,
     present: Flags,
     predicted: Floats,
-    known: Flags,
     turned: Floats,
     low: Floats,
     high: Floats,
@@ -199,7 +198,7 @@ def weigh(
 
     Args:
         shown, present: observations [N, V, F], and the rows that are cars [N, V].
-        predicted, known: the reckoned egos of the state, [N, 6], and whether they are known, [N].
+        predicted: the reckoned egos, states [N, 7].
         turned: cosine and sine of their headings, [N, 2]; changed here.
         low, high: the boxes, [N, V, F - 1].
         tables, side, asked, rules: as in `kernels.rooms`.
@@ -210,16 +209,17 @@ def weigh(
         1 for those that are allowed, else 0 [N, 5]; whether any is safe [N]; and what `weigh_backward` needs.
     """
     count, cars = len(shown), shown.shape[1] - 1
-    seen, x, hard, safe = shown.copy(), np.empty((count, 5), np.float32), np.empty((count, 5), np.float32), known.copy()
+    seen, x, hard = shown.copy(), np.empty((count, 5), np.float32), np.empty((count, 5), np.float32)
+    safe = np.empty(count, np.bool_)
     ego, slopes = np.empty((count, 6), np.float32), np.empty((count, 4), np.float32)
     lower, upper = np.empty((count, cars, 4), np.float32), np.empty((count, cars, 4), np.float32)
-    others, right = np.empty((count, cars), np.bool_), known.copy()
+    others, right = np.empty((count, cars), np.bool_), np.empty(count, np.bool_)
     along, lane = np.empty(count, np.float32), np.empty(count, np.float32)
     wanted = np.empty((count, *asked.shape), np.bool_)
     own, slowing = np.empty((count, 4), np.float32), np.empty((count, 4), np.float32)
     for n in range(count):
         now = ego[n]
-        corrected(predicted[n], known[n], low[n, 0], high[n, 0], of.car, now, turned[n], slopes[n])
+        corrected(predicted[n], low[n, 0], high[n, 0], of.car, now, turned[n], slopes[n])
         along[n], lane[n] = now[SPEED] * turned[n, 0], of.car.lane_width * now[LANE]
         across = now[SPEED] * turned[n, 1]
         seen[n, 0, 2] = clamped(_normalised(now[Y], 1, of), -ONE, ONE)

@@ -63,13 +63,13 @@ class Mask:
         """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
         return compilable(observation, state)
 
-    def __call__(self, observation: Tensor, boxes: Boxes, ego: TensorDictBase) -> Weighed:
+    def __call__(self, observation: Tensor, boxes: Boxes, ego: Tensor) -> Weighed:
         """What the filter makes of observations that it `fits`, differentiable once in them and in the boxes.
 
         Args:
             observation: as shown, [..., V, F].
             boxes: their boxes, [..., V, F - 1].
-            ego: the reckoned ego, a state as of `DeadReckoning.after`.
+            ego: the reckoned ego, a state [..., 7] as of `DeadReckoning.after`.
         """
         return Weighed(*_Weigh.apply(observation, boxes.low, boxes.high, boxes.present, ego, self))
 
@@ -114,7 +114,7 @@ class Mask:
 class _Weigh(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, observation: Tensor, low: Tensor, high: Tensor, present: Tensor, ego: TensorDictBase, of: Mask
+        ctx: Any, observation: Tensor, low: Tensor, high: Tensor, present: Tensor, ego: Tensor, of: Mask
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         leading, (tables, side), rooms = observation.shape[:-2], of.tables, of.judge.rooms
         given = flat(observation, 2), flat(present, 1), *predicted(ego), flat(low, 2), flat(high, 2)

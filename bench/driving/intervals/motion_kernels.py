@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point, inner
-from cavbench.driving.intervals.kernels import Flags, Floats
+from cavbench.driving.intervals.kernels import Floats
 
-Y, HEADING, SPEED, LANE, TARGET, EDGE = range(6)
-"""The fields of `cavbench.driving.intervals.ego.Ego`."""
+Y, HEADING, SPEED, LANE, TARGET, EDGE, KNOWN = range(7)
+"""The fields of `cavbench.driving.intervals.ego.Ego`, and, of a state, whether they are known."""
 
 
 SLACK = 1.0
@@ -114,13 +114,11 @@ def _nearest_target(speed: np.float32, car: Car) -> np.float32:
 
 
 @inner
-def corrected(
-    ego: Floats, known: bool, low: Floats, high: Floats, car: Car, now: Floats, turned: Floats, slopes: Floats
-) -> None:
+def corrected(ego: Floats, low: Floats, high: Floats, car: Car, now: Floats, turned: Floats, slopes: Floats) -> None:
     """`DeadReckoning.now`: fills `now` [6] and `slopes`.
 
     Args:
-        ego, known: the predicted ego [6], and whether there is one.
+        ego: the predicted ego, a state [7].
         low, high: the box of the measured row, [4].
         car: the kinematics.
         now: the ego.
@@ -130,8 +128,8 @@ def corrected(
     zero, one = np.float32(0), np.float32(1)
     slack, off, edge = np.float32(SLACK), np.float32(OFF_THE_ROAD), np.float32(UNKNOWN_EDGE)
     below, above = low[1], high[1]
-    now[:], slopes[:] = ego, zero
-    if not known:
+    now[:], slopes[:] = ego[:KNOWN], zero
+    if not ego[KNOWN] > zero:
         middle = _middle(below, above)
         first = np.rint(middle / car.lane_width)
         first = zero if first < zero else first
@@ -161,18 +159,18 @@ def corrected(
 
 
 @entry_point
-def reckon(predicted: Floats, known: Flags, turned: Floats, low: Floats, high: Floats, car: Car, egos: Floats) -> None:
+def reckon(predicted: Floats, turned: Floats, low: Floats, high: Floats, car: Car, egos: Floats) -> None:
     """The egos at an observation; fills `egos` [N, 6].
 
     Args:
-        predicted, known: the predicted egos [N, 6], and whether there is one, [N].
+        predicted: the predicted egos, states [N, 7].
         turned: cosine and sine of their headings, [N, 2]; changed where a heading is.
         low, high: the boxes, [N, V, 4], of which the ego's is read.
         car: the kinematics.
     """
     slopes = np.empty(4, np.float32)
     for n in range(len(egos)):
-        corrected(predicted[n], known[n], low[n, 0], high[n, 0], car, egos[n], turned[n], slopes)
+        corrected(predicted[n], low[n, 0], high[n, 0], car, egos[n], turned[n], slopes)
 
 
 @entry_point

@@ -7,12 +7,13 @@ from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
+from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.core.ranges import NotNegative, Share
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.intervals.boxes import Boxes
-from cavbench.driving.intervals.ego import UNKNOWN_EDGE, Ego
+from cavbench.driving.intervals.ego import UNKNOWN_EDGE, Ego, Step
 from cavbench.driving.intervals.kernels import SIDES
 from cavbench.driving.intervals.margins import Judge
 from cavbench.driving.intervals.policy import IntervalPolicy
@@ -80,11 +81,11 @@ class IntervalPlanner(IntervalPolicy):
         self.judge = Judge(self.reckoning, self.period, caution)
 
     def initial(self, episodes: Tensor) -> State:
-        return self.reckoning.unknown(episodes)
+        return TensorDict({"ego": self.reckoning.unknown(episodes)}, batch_size=episodes.shape)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        ego = self.reckoning.now(boxes, state)
+        ego = self.reckoning.now(boxes, state["ego"])
         cars = cars_of(ego, boxes)
         found = self.judge(ego, cars)
         left, own, right = self._worth(ego, self.judge.rooms.speeds(ego, cars)).unbind(-1)
@@ -99,12 +100,12 @@ class IntervalPlanner(IntervalPolicy):
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        ego = self.reckoning.now(boxes, state)
+        ego = self.reckoning.now(boxes, state["ego"])
         return self.judge(ego, cars_of(ego, boxes)).safe
 
-    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+    def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
         assert state is not None
-        return self.reckoning.step(boxes, state, action)[1]
+        return TensorDict({"ego": step.after}, batch_size=state.batch_size)
 
     def _worth(self, ego: Ego, speed: Tensor) -> Tensor:
         """[..., 3] the progress on the left, own and right lane, or on a lane beyond it less the detour."""
