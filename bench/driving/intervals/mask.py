@@ -11,7 +11,8 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from cavbench.driving.intervals import filter_kernels, margins
+from cavbench.driving.features import Features
+from cavbench.driving.intervals import filter_kernels, judge_kernels, margins
 from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.ego import predicted
 
@@ -39,6 +40,19 @@ def compilable(observation: Tensor, state: TensorDictBase) -> bool:
     if observation.shape[-2] < 2 or torch._C._are_functorch_transforms_active():
         return False
     return state.batch_size == observation.shape[:-2]
+
+
+def facts(judge: margins.Judge, features: Features) -> judge_kernels.Facts:
+    """The world and the constants of a judge as the compiled loops take them."""
+    least, most = np.array(features.low, np.float32), np.array(features.high, np.float32)
+    single = {
+        "kept": judge.reckoning.kept,
+        "settled_m": margins.SETTLED_M,
+        "settled_rad": margins.SETTLED_RAD,
+        "clearing_m": margins.CLEARING_M,
+    }
+    numbers = {name: np.float32(value) for name, value in single.items()}
+    return judge_kernels.Facts(judge.reckoning.car, margins.PARTS, low=least, span=most - least, **numbers)
 
 
 class Mask:
@@ -85,19 +99,9 @@ class Mask:
         return scores
 
     @cached_property
-    def facts(self) -> filter_kernels.Facts:
+    def facts(self) -> judge_kernels.Facts:
         """The world and the constants as the compiled loops take them."""
-        reckoning, features = self.judge.reckoning, self.assumed.features
-        least, most = np.array(features.low, np.float32), np.array(features.high, np.float32)
-        single = {
-            "kept": reckoning.kept,
-            "settled_m": margins.SETTLED_M,
-            "settled_rad": margins.SETTLED_RAD,
-            "clearing_m": margins.CLEARING_M,
-            "band": self.band,
-        }
-        numbers = {name: np.float32(value) for name, value in single.items()}
-        return filter_kernels.Facts(reckoning.car, margins.PARTS, low=least, span=most - least, **numbers)
+        return facts(self.judge, self.assumed.features)
 
     @cached_property
     def order(self) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -118,7 +122,9 @@ class _Weigh(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         leading, (tables, side), rooms = observation.shape[:-2], of.tables, of.judge.rooms
         given = flat(observation, 2), flat(present, 1), *predicted(ego), flat(low, 2), flat(high, 2)
-        *found, kept = filter_kernels.weigh(*given, tables, side, rooms.asked, rooms.rules, of.facts)
+        *found, kept = filter_kernels.weigh(
+            *given, tables, side, rooms.asked, rooms.rules, of.facts, np.float32(of.band)
+        )
         ctx.of, ctx.kept, ctx.shape = of, kept, observation.shape
         seen, margin, hard, safe = map(torch.from_numpy, found)
         answers = seen.view(observation.shape), margin.view(*leading, 5), hard.view(*leading, 5), safe.view(leading)

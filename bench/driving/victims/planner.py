@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
+import numpy as np
 import torch
 from annotated_types import Interval
 from tensordict import TensorDict
@@ -18,6 +19,8 @@ from cavbench.driving.intervals.kernels import SIDES
 from cavbench.driving.intervals.margins import Judge
 from cavbench.driving.intervals.policy import IntervalPolicy
 from cavbench.driving.intervals.rooms import Caution, cars_of
+from cavbench.driving.intervals.worth import Worth
+from cavbench.driving.intervals.worth_kernels import Worths
 from cavbench.driving.threat import Norm
 
 FORBIDDEN, UNSAFE = -10.0, -2.0
@@ -79,12 +82,15 @@ class IntervalPlanner(IntervalPolicy):
         self.rules = rules
         caution = Caution(braking=rules.braking, seconds=rules.braking_s, distance=rules.distance)
         self.judge = Judge(self.reckoning, self.period, caution)
+        self.compiled = Worth(self.judge, facts.features, self._values())
 
     def initial(self, episodes: Tensor) -> State:
         return TensorDict({"ego": self.reckoning.unknown(episodes)}, batch_size=episodes.shape)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
+        if self.compiled.fits(observation, state):
+            return self.compiled(boxes, state["ego"])[0]
         ego = self.reckoning.now(boxes, state["ego"])
         cars = cars_of(ego, boxes)
         found = self.judge(ego, cars)
@@ -100,12 +106,21 @@ class IntervalPlanner(IntervalPolicy):
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
+        if self.compiled.fits(boxes.low, state):
+            return self.compiled(boxes, state["ego"])[1]
         ego = self.reckoning.now(boxes, state["ego"])
         return self.judge(ego, cars_of(ego, boxes)).safe
 
     def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
         assert state is not None
         return TensorDict({"ego": step.after}, batch_size=state.batch_size)
+
+    def _values(self) -> Worths:
+        """The constants as the compiled loops take them."""
+        top, rules = self.reckoning.kinematics.target_speeds[-1], self.rules
+        first = FORBIDDEN, UNSAFE, LANE, SPEED, SLOWEST, top - SLOWEST, PER_METRE, TIE_BREAK
+        last = rules.right, rules.gain, rules.detour
+        return Worths(*map(np.float32, first), np.array(ORDER, np.float32), *map(np.float32, last))
 
     def _worth(self, ego: Ego, speed: Tensor) -> Tensor:
         """[..., 3] the progress on the left, own and right lane, or on a lane beyond it less the detour."""
