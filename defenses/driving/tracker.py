@@ -7,7 +7,6 @@ from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.core.ranges import NotNegative
@@ -78,9 +77,7 @@ class Tracked(PolicyWrapper):
         elif remembers(self.policy):
             inner = self.policy.advance(self._estimate(observation, boxes, state), action, inner)
         tracks = predicted(boxes, *step, self.reckoning.kinematics, self.period)
-        return with_inner(
-            {"ego": step.after, "tracks": TensorDict(tracks, batch_size=state.batch_size)}, inner, state.batch_size
-        )
+        return with_inner({"ego": step.after, "tracks": tracks}, inner, state.batch_size)
 
     def passed(self, observation: Tensor, state: State = None) -> Passed:
         assert state is not None

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.compiled import entry_point, inner
-from cavbench.driving.intervals.kernels import Floats
+from cavbench.driving.intervals.kernels import Flags, Floats
 
 Y, HEADING, SPEED, LANE, TARGET, EDGE, KNOWN = range(7)
 """The fields of `cavbench.driving.intervals.ego.Ego`, and, of a state, whether they are known."""
@@ -231,14 +231,16 @@ class Limits(NamedTuple):
 
 
 @entry_point
-def later(low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, lower: Floats, upper: Floats) -> None:
-    """The boxes of the other cars one decision later, relative to the ego; fills `lower` and `upper` [N, V - 1, 4].
+def later(present: Flags, low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, tracks: Floats) -> None:
+    """The boxes of the other cars one decision later, relative to the ego; fills `tracks` [N, V - 1, 9].
 
     Args:
+        present: the rows that are cars, [N, V].
         low, high: the boxes now, [N, V, 4]; the ego's own is not read.
-        before, after: the egos now and then, [N, 6].
+        before, after: the egos now and then, [N, 6] or states [N, 7].
         of: the limits.
-        lower, upper: the bounds of x relative to the ego, and of y, vx and vy relative to its own.
+        tracks: 1 for a car, else 0, the lower bounds and the upper ones: of x relative to the ego, and of y, vx and vy
+            relative to its own.
     """
     zero, one = np.float32(0), np.float32(1)
     for n in range(len(low)):
@@ -247,7 +249,9 @@ def later(low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, 
         driven_x = (speed + after[n, SPEED]) / np.float32(2) * cos * of.period
         then_y = after[n, Y]
         then_vx, then_vy = after[n, SPEED] * np.cos(after[n, HEADING]), after[n, SPEED] * np.sin(after[n, HEADING])
-        for c in range(lower.shape[1]):
+        for c in range(tracks.shape[1]):
+            track = tracks[n, c]
+            track[0] = one if present[n, c + 1] else zero
             x_low, y_low = low[n, c + 1, 0], low[n, c + 1, 1] + own_y
             x_high, y_high = high[n, c + 1, 0], high[n, c + 1, 1] + own_y
             vx_low, vy_low = low[n, c + 1, 2] + own_vx, low[n, c + 1, 3] + own_vy
@@ -265,11 +269,11 @@ def later(low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, 
             y_low += (vy_low - fastest * slip) * of.period
             y_high += (vy_high + fastest * slip) * of.period
             x_high += fastest * of.period
-            lower[n, c, 0] = x_low - driven_x - of.rounding
-            lower[n, c, 1] = y_low - then_y - of.rounding
-            lower[n, c, 2] = vx - then_vx - of.rounding
-            lower[n, c, 3] = vy_low - then_vy - of.rounding
-            upper[n, c, 0] = x_high - driven_x + of.rounding
-            upper[n, c, 1] = y_high - then_y + of.rounding
-            upper[n, c, 2] = fastest - then_vx + of.rounding
-            upper[n, c, 3] = vy_high - then_vy + of.rounding
+            track[1] = x_low - driven_x - of.rounding
+            track[2] = y_low - then_y - of.rounding
+            track[3] = vx - then_vx - of.rounding
+            track[4] = vy_low - then_vy - of.rounding
+            track[5] = x_high - driven_x + of.rounding
+            track[6] = y_high - then_y + of.rounding
+            track[7] = fastest - then_vx + of.rounding
+            track[8] = vy_high - then_vy + of.rounding

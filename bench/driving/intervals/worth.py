@@ -47,8 +47,10 @@ class Worth:
             boxes: of observations that it `fits`, [..., V, F - 1].
             ego: the reckoned ego, a state [..., 7] as of `DeadReckoning.after`.
         """
-        scores, safe = _Worth.apply(boxes.low, boxes.high, boxes.present, ego, self)
-        return scores, safe
+        if boxes.low.requires_grad and torch.is_grad_enabled():
+            scores, safe = _Worth.apply(boxes.low, boxes.high, boxes.present, ego, self)
+            return scores, safe
+        return _worth(boxes, ego, self)[0]
 
     @cached_property
     def facts(self) -> judge_kernels.Facts:
@@ -61,22 +63,29 @@ class Worth:
         return np.array(self.judge.reckoning.order, np.int64)
 
 
+def _worth(boxes: Boxes, ego: Tensor, of: Worth) -> tuple[tuple[Tensor, Tensor], list[Any]]:
+    """The scores, and whether any action is safe; and what the gradient needs besides."""
+    rooms, leading = of.judge.rooms, boxes.low.shape[:-2]
+    given = flat(boxes.present, 1), *predicted(ego), flat(boxes.low, 2), flat(boxes.high, 2)
+    tables = rooms.following.tables, rooms.following.side, rooms.asked, rooms.rules
+    scores, safe, *kept = worth_kernels.worth(*given, *tables, of.facts, rooms.top, of.values, of.order)
+    answers = torch.from_numpy(scores).view(*leading, scores.shape[1]), torch.from_numpy(safe).view(leading)
+    return answers, kept
+
+
 class _Worth(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, low: Tensor, high: Tensor, present: Tensor, ego: Tensor, of: Worth) -> tuple[Tensor, Tensor]:
-        rooms, leading = of.judge.rooms, low.shape[:-2]
-        tables = rooms.following.tables, rooms.following.side
-        given = flat(present, 1), *predicted(ego), flat(low, 2), flat(high, 2)
-        scores, safe, *kept = worth_kernels.worth(
-            *given, *tables, rooms.asked, rooms.rules, of.facts, rooms.top, of.values, of.order
-        )
-        ctx.kept, ctx.given, ctx.shape = kept, (*tables, rooms.rules, of.facts, of.values, of.order), low.shape
-        answers = torch.from_numpy(scores).view(*leading, scores.shape[1]), torch.from_numpy(safe).view(leading)
+        answers, ctx.kept = _worth(Boxes(present, low, high), ego, of)
+        ctx.of, ctx.shape = of, low.shape
         ctx.mark_non_differentiable(answers[1])
         return answers
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_scores: Tensor, _: Any) -> tuple[Tensor | None, ...]:
-        by_low, by_high = worth_kernels.worth_backward(flat(by_scores, 1), *ctx.kept, *ctx.given)
+        of, rooms = ctx.of, ctx.of.judge.rooms
+        tables = rooms.following.tables, rooms.following.side, rooms.rules
+        given = *ctx.kept, *tables, of.facts, of.values, of.order
+        by_low, by_high = worth_kernels.worth_backward(flat(by_scores, 1), *given)
         return torch.from_numpy(by_low).view(ctx.shape), torch.from_numpy(by_high).view(ctx.shape), None, None, None

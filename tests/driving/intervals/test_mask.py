@@ -169,7 +169,7 @@ def test_boxes_within_tracks_and_their_gradients_are_those_of_torch(seed: int) -
     shift = torch.randn(100, ROWS - 1, 4, generator=generator)
     low, high = near.low[:, 1:] + shift, near.high[:, 1:] + shift * torch.rand(shift.shape, generator=generator)
     tracked = torch.rand(100, ROWS - 1, generator=generator) < 0.8
-    tracks = TensorDict({"low": low, "high": high, "present": tracked}, [100])
+    tracks = torch.cat((tracked.float().unsqueeze(-1), low, high), -1)
     asked, other = shown.clone().requires_grad_(), shown.clone().requires_grad_()
     found, wanted = assumed.boxes(asked, tracks), by_torch_code.narrowed(assumed.boxes(other), low, high, tracked)
     assert torch.equal(found.low, wanted.low)
