@@ -117,10 +117,21 @@ class IntervalPlanner(IntervalPolicy):
 
     def _values(self) -> Worths:
         """The constants as the compiled loops take them."""
-        top, rules = self.reckoning.kinematics.target_speeds[-1], self.rules
-        first = FORBIDDEN, UNSAFE, LANE, SPEED, SLOWEST, top - SLOWEST, PER_METRE, TIE_BREAK
-        last = rules.right, rules.gain, rules.detour
-        return Worths(*map(np.float32, first), np.array(ORDER, np.float32), *map(np.float32, last))
+        rules = self.rules
+        single = {
+            "forbidden": FORBIDDEN,
+            "unsafe": UNSAFE,
+            "lane": LANE,
+            "speed": SPEED,
+            "slowest": SLOWEST,
+            "span": self.reckoning.kinematics.target_speeds[-1] - SLOWEST,
+            "per_metre": PER_METRE,
+            "tie_break": TIE_BREAK,
+            "right": rules.right,
+            "gain": rules.gain,
+            "detour": rules.detour,
+        }
+        return Worths(order=np.array(ORDER, np.float32), **{name: np.float32(value) for name, value in single.items()})
 
     def _worth(self, ego: Ego, speed: Tensor) -> Tensor:
         """[..., 3] the progress on the left, own and right lane, or on a lane beyond it less the detour."""
