@@ -12,7 +12,7 @@ from rich.console import Console
 from cavbench.leaderboard.published import every_track
 from cavbench.leaderboard.ranking.boards import read_boards
 from cavbench.leaderboard.terminal.ranking import flags_report, leaderboard_report
-from tests.leaderboard.synthetic import CLEAR, drive
+from tests.leaderboard.synthetic import CLEAR, approach, drive, probed
 
 LONG = {"behind": "tracker+shield"}
 
@@ -54,6 +54,18 @@ def test_a_row_of_one_patch_has_no_rank(published: dict[str, pa.Table]) -> None:
     assert all((row.group == 0) == (len(row.worst.scores) == 1) for row in rows)
     said = " ".join(printed(leaderboard_report, detection, 120).split())
     assert "rows of one patch without a rank: another patch may take more or less" in said
+
+
+def test_a_ranking_says_what_the_driven_car_does_where_a_loop_was_closed() -> None:
+    clean, attacked = approach(0.9), approach(0.1, attack="eot")
+    loop = (
+        probed(clean, stopped=True, collided=False, drive_overrun_m=0.0),
+        probed(attacked, stopped=False, collided=True, drive_overrun_m=16.0),
+    )
+    texts = [printed(leaderboard_report, {"detection": pa.concat_tables(one)}, 200) for one in ((clean, attacked), loop)]
+    assert ["in loop" in text and "collides" in text for text in texts] == [False, True]
+    row = next(line for line in texts[1].splitlines() if " none " in line)
+    assert row.index("0 %") < row.index("16.0") < row.index("100 %", row.index("16.0"))
 
 
 def test_why_rows_are_flagged_is_told_on_request() -> None:
