@@ -66,6 +66,7 @@ def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("commit")
+    parser.add_argument("--victim", default="dqn")
     parser.add_argument("--defenses", nargs="+", default=["smoothing", "pessimist_q"])
     parser.add_argument("--attacks", nargs="+", default=["pgd", "plan", "rehearse", "zo", "noise"])
     parser.add_argument("--units", type=int, default=12, help="at most 27")
@@ -81,6 +82,7 @@ def main() -> None:
         print("| defence | attack | before, ms | now, ms | before / now | same |\n|---|---|---|---|---|---|")
         for defense, attack in product(given.defenses, given.attacks):
             work = {
+                "victim": given.victim,
                 "defense": defense,
                 "attack": attack,
                 "units": given.units,
@@ -107,7 +109,7 @@ def serve() -> None:
         print(json.dumps(driven(**json.loads(line))), flush=True)
 
 
-def driven(*, defense: str, attack: str, units: int, episodes: int, decisions: int) -> dict[str, Any]:
+def driven(*, victim: str, defense: str, attack: str, units: int, episodes: int, decisions: int) -> dict[str, Any]:
     """CPU seconds of a decision of an episode, and the columns of the records as text."""
     from cavbench.core.pair import Pair, choose
     from cavbench.core.track import Job
@@ -116,13 +118,13 @@ def driven(*, defense: str, attack: str, units: int, episodes: int, decisions: i
     from cavbench.envs.highway.world import HighwayWorld
     from cavbench.scenarios import SeedBlock
 
-    victim, world = choose("victim", "dqn"), choose("world", "highway")
+    driver, world = choose("victim", victim), choose("world", "highway")
     pair = Pair(
         attack=choose("attack", attack),
         defense=choose("defense", defense),
-        victim=victim,
+        victim=driver,
         world=replace(world, component=HighwayWorld(max_steps=decisions)),
-        threat=victim.component.threat(access="dynamics"),
+        threat=driver.component.threat(access="dynamics"),
     )
     cells = [
         AXES.cell(lanes=lanes, density=density, weather=weather)

@@ -3,6 +3,7 @@
     python benchmarks/compiled_speed.py [--attacks pgd zo rehearse] [--defense advtrain] [--episodes 20] [--rounds 3]
     python benchmarks/compiled_speed.py --part filter --defense tracker+shield --attacks pgd rehearse
     python benchmarks/compiled_speed.py --part belief --defense pessimist_q --attacks pgd
+    python benchmarks/compiled_speed.py --part rules --victim planner --defense tracker --attacks pgd
 
 Prints the CPU time of a pass of the victim, forward and with its gradient, and of whole units, each as torch's over that of the
 compiled code. Both are measured alternately in one process and one thread, on scenarios that tune attacks; the median of the
@@ -28,6 +29,7 @@ from cavbench.driving.drive import drive
 from cavbench.driving.fused.network import Fused
 from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.intervals.mask import Mask
+from cavbench.driving.intervals.worth import Worth
 from cavbench.driving.policy import repeated
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
@@ -35,7 +37,7 @@ from cavbench.errors import in_one_line
 from cavbench.run.process import settle
 from cavbench.scenarios import SeedBlock
 
-PARTS = {"network": Fused, "filter": Mask, "belief": Belief}
+PARTS = {"network": Fused, "filter": Mask, "belief": Belief, "rules": Worth}
 SIZES = (20, 40, 160, 720, 1600)
 
 

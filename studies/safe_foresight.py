@@ -72,7 +72,7 @@ def driven(cell: Cell, episodes: int, budget: float, foresight: bool) -> tuple[f
         shown = torch.from_numpy(engine.observation.copy())
         boxes = policy.assumed.boxes(shown)
         assert state is not None
-        ego = policy.reckoning.now(boxes, state)
+        ego = policy.reckoning.now(boxes, state["ego"])
         found = policy.judge(ego, cars_of(ego, boxes))
         change = (found.change >= 0) & found.changeable
         safe = torch.cat((found.stay >= 0, change), -1)[..., policy.reckoning.order]

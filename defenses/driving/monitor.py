@@ -15,6 +15,7 @@ from cavbench.defenses.driving.tracker import Tracker
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, PolicyWrapper, State, Suspicion
 from cavbench.driving.intervals.boxes import Assumed
 from cavbench.driving.intervals.consistency import Consistency
+from cavbench.driving.intervals.ego import fields
 from cavbench.driving.intervals.policy import reckoning, with_inner
 from cavbench.driving.victims.planner import Planner
 from cavbench.errors import UserError
@@ -120,8 +121,8 @@ class Monitored(PolicyWrapper):
         assert state is not None
         cars = state.get("cars", None)
         measured = self.consistency.features.physical(observation)[:, 0, 2]
-        ego = state["ego"]
-        reckoned = torch.where(ego["known"], ego["speed"] * ego["heading"].cos(), measured)
+        ego, known = fields(state["ego"])
+        reckoned = torch.where(known, ego.speed * ego.heading.cos(), measured)
         before = self.consistency.initial(observation) if cars is None else cars
         return self.consistency.step(observation, reckoned, before)
 

@@ -14,7 +14,7 @@ from cavbench.core.ranges import Count, Share
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.intervals.boxes import Boxes
-from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.ego import Ego, Step
 from cavbench.driving.intervals.policy import IntervalPolicy, corrected, remembers, with_inner
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
@@ -79,9 +79,9 @@ class Believing(IntervalPolicy):
         lowest = values.amin(0)
         return values[0] + self.settings.pessimism * (lowest - values[0])
 
-    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+    def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
         assert state is not None
-        ego, after = self.reckoning.step(boxes, state["ego"], action)
+        ego, after = step
         inner = state.get("inner", None)
         if remembers(self.policy):
             middle = corrected(self.belief(observation, boxes, corners=False)[0], ego, self.assumed)

@@ -14,7 +14,7 @@ from cavbench.core.ranges import NotNegative
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, State
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.corridor import Corridor, CorridorJudge
-from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.ego import Ego, Step
 from cavbench.driving.intervals.margins import Judge, Margins
 from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.intervals.policy import IntervalPolicy, corrected, remembers, with_inner
@@ -79,9 +79,9 @@ class Filter(IntervalPolicy):
         own = {"ego": self.reckoning.unknown(episodes)}
         return with_inner(own, self.policy.initial(episodes), episodes.shape)
 
-    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+    def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
         assert state is not None
-        ego, after = self.reckoning.step(boxes, state["ego"], action)
+        ego, after = step
         inner = state.get("inner", None)
         if remembers(self.policy):
             inner = self.policy.advance(corrected(observation, ego, self.assumed), action, inner)

@@ -7,7 +7,6 @@ from typing import Annotated, ClassVar
 
 import torch
 from annotated_types import Interval
-from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.core.ranges import NotNegative
@@ -71,15 +70,14 @@ class Tracked(PolicyWrapper):
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
         boxes, inner = self.boxes(observation, state), state.get("inner", None)
+        # One car, one motion: a policy on intervals does not reckon it again.
+        step = self.reckoning.step(boxes, state["ego"], action)
         if isinstance(self.policy, IntervalPolicy):
-            inner = self.policy.moved(observation, boxes, action, inner)
+            inner = self.policy.moved(observation, boxes, step, action, inner)
         elif remembers(self.policy):
             inner = self.policy.advance(self._estimate(observation, boxes, state), action, inner)
-        ego, after = self.reckoning.step(boxes, state["ego"], action)
-        tracks = TensorDict(
-            predicted(boxes, ego, after, self.reckoning.kinematics, self.period), batch_size=state.batch_size
-        )
-        return with_inner({"ego": after, "tracks": tracks}, inner, state.batch_size)
+        tracks = predicted(boxes, *step, self.reckoning.kinematics, self.period)
+        return with_inner({"ego": step.after, "tracks": tracks}, inner, state.batch_size)
 
     def passed(self, observation: Tensor, state: State = None) -> Passed:
         assert state is not None

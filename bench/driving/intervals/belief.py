@@ -37,7 +37,7 @@ class Belief:
         """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
         return compilable(observation, state)
 
-    def __call__(self, observation: Tensor, boxes: Boxes, ego: TensorDictBase, signs: Tensor) -> Tensor:
+    def __call__(self, observation: Tensor, boxes: Boxes, ego: Tensor, signs: Tensor) -> Tensor:
         """The points [3 + K, ..., V, F] of observations that it `fits`, differentiable once in them and in the boxes.
 
         The first ones are the middle, the corner where every car is nearer and closing faster, and the opposite one.
@@ -45,7 +45,7 @@ class Belief:
         Args:
             observation: as shown, [..., V, F].
             boxes: their boxes, [..., V, F - 1].
-            ego: the reckoned ego, a state as of `DeadReckoning.after`.
+            ego: the reckoned ego, a state [..., 7] as of `DeadReckoning.after`.
             signs: further corners, -1 or 1, [K, V, F - 1].
         """
         points: Tensor = _Believe.apply(observation, boxes.low, boxes.high, boxes.present, ego, signs, self)
@@ -67,15 +67,15 @@ class _Believe(torch.autograd.Function):
         low: Tensor,
         high: Tensor,
         present: Tensor,
-        ego: TensorDictBase,
+        ego: Tensor,
         signs: Tensor,
         of: Belief,
     ) -> Tensor:
-        shown, there, (egos, known, turned) = flat(observation, 2), flat(present, 1), predicted(ego)
+        shown, there, (egos, turned) = flat(observation, 2), flat(present, 1), predicted(ego)
         box, corners = (flat(low, 2), flat(high, 2)), flat(signs, 2)
         points = np.empty((3 + len(corners), *shown.shape), np.float32)
         motion, slopes = np.empty((len(shown), 3), np.float32), np.empty((len(shown), 4), np.float32)
-        given = shown, there, egos, known, turned, *box, corners, of.reckoning.car, of.scale
+        given = shown, there, egos, turned, *box, corners, of.reckoning.car, of.scale
         belief_kernels.believe(*given, points, motion, slopes)
         ctx.kept, ctx.shape = (there, turned, *box, corners, of.scale, motion, slopes), observation.shape
         return torch.from_numpy(points).view(len(points), *observation.shape)

@@ -43,7 +43,6 @@ def believe(
     shown: Floats,
     present: Flags,
     predicted: Floats,
-    known: Flags,
     turned: Floats,
     low: Floats,
     high: Floats,
@@ -58,7 +57,7 @@ def believe(
 
     Args:
         shown, present: observations [N, V, F], and the rows that are cars [N, V].
-        predicted, known: the reckoned egos of the state, [N, 6], and whether they are known, [N].
+        predicted: the reckoned egos, states [N, 7].
         turned: cosine and sine of their headings, [N, 2]; changed where a heading is.
         low, high: the boxes, [N, V, 4].
         signs: random corners, [K, V, 4].
@@ -71,7 +70,7 @@ def believe(
     """
     now, own = np.empty(6, np.float32), np.empty(3, np.float32)
     for n in range(len(shown)):
-        corrected(predicted[n], known[n], low[n, 0], high[n, 0], car, now, turned[n], slopes[n])
+        corrected(predicted[n], low[n, 0], high[n, 0], car, now, turned[n], slopes[n])
         motion[n, 0] = _normalised(now[Y], 1, of)
         motion[n, 1] = _normalised(now[SPEED] * turned[n, 0], 2, of)
         motion[n, 2] = _normalised(now[SPEED] * turned[n, 1], 3, of)

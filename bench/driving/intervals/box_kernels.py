@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavbench.compiled import entry_point
-from cavbench.driving.intervals.kernels import Flags, Floats
+from cavbench.driving.intervals.kernels import Floats
 
 
 class Set(NamedTuple):
@@ -67,15 +67,12 @@ def boxes(shown: Floats, of: Set, low: Floats, high: Floats, slopes: Floats) -> 
 
 
 @entry_point
-def narrow(
-    shown: Floats, track_low: Floats, track_high: Floats, tracked: Flags, low: Floats, high: Floats, slopes: Floats
-) -> None:
+def narrow(shown: Floats, tracks: Floats, low: Floats, high: Floats, slopes: Floats) -> None:
     """The boxes of other cars, each intersected with the hull of all tracks that it may belong to, in place.
 
     Args:
         shown: observations [N, V, F].
-        track_low, track_high: bounds of the tracks, [N, K, F - 1].
-        tracked: the tracks that exist, [N, K].
+        tracks: 1 for those that exist, else 0, their lower bounds and their upper ones, [N, K, 2 F - 1].
         low, high, slopes: as `boxes` filled them. The slope of a bound that is moved is 0.
     """
     features, sloped = low.shape[2], slopes.shape[1] > 0
@@ -87,17 +84,18 @@ def narrow(
                 continue
             least[:], most[:] = np.inf, -np.inf
             fits_any = False
-            for track in range(track_low.shape[1]):
-                fits = tracked[n, track]
+            for one in range(tracks.shape[1]):
+                track = tracks[n, one]
+                fits = track[0] > 0
                 for f in range(features):
                     if not fits:
                         break
-                    fits = low[n, box, f] <= track_high[n, track, f] and track_low[n, track, f] <= high[n, box, f]
+                    fits = low[n, box, f] <= track[1 + features + f] and track[1 + f] <= high[n, box, f]
                 if fits:
                     fits_any = True
                     for f in range(features):
-                        least[f] = min(least[f], track_low[n, track, f])
-                        most[f] = max(most[f], track_high[n, track, f])
+                        least[f] = min(least[f], track[1 + f])
+                        most[f] = max(most[f], track[1 + features + f])
             for f in range(features):
                 lower, upper = max(low[n, box, f], least[f]), min(high[n, box, f], most[f])
                 if not (fits_any and lower <= upper):

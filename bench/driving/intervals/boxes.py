@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
@@ -51,7 +50,7 @@ class Assumed:
     budget: float
     noise: float = 0.0
 
-    def boxes(self, shown: Tensor, tracks: TensorDictBase | None = None) -> Boxes:
+    def boxes(self, shown: Tensor, tracks: Tensor | None = None) -> Boxes:
         """The true values from which the set leads to the shown ones: the inverse of `ObservationThreat.radius`.
 
         With the norm `relative` a shown z stands for true values in [min(z - f, z / (1 +- b)), max(z + f, z / (1 -+ b))], where
@@ -60,13 +59,14 @@ class Assumed:
 
         Args:
             shown: the observation that the policy received, [..., V, F], on the normalised scale.
-            tracks: the boxes that `tracks.predicted` gave for the same episodes; each other car's box is intersected with the
+            tracks: what `tracks.predicted` gave for the same episodes; each other car's box is intersected with the
                 hull of all those that it may belong to. The hull makes it sound where a measurement fits several cars. A box
                 that fits none stays, and so does a feature whose intersection is empty.
         """
-        fields = {} if tracks is None else dict(tracks.items())
-        known = tuple(fields[name] for name in ("low", "high", "present")) if fields else ()
-        low, high = _Boxes.apply(shown, self._set, known)
+        if shown.requires_grad and torch.is_grad_enabled():
+            low, high = _Boxes.apply(shown, self._set, tracks)
+        else:
+            low, high, _ = _bounds(shown, self._set, tracks, sloped=False)
         return Boxes(shown[..., 0] > 0, low, high)
 
     @cached_property
@@ -87,19 +87,26 @@ class Assumed:
         return self.features.normalised(values).clamp(-1, 1)
 
 
+def _bounds(
+    shown: Tensor, of: box_kernels.Set, tracks: Tensor | None, *, sloped: bool
+) -> tuple[Tensor, Tensor, NDArray[Any]]:
+    """The bounds [..., V, F - 1], and how both change with the shown values, [2, N, V, F - 1], if wanted."""
+    rows, size = shown.shape[-2:]
+    given = flat(shown, 2)
+    low, high = np.empty((2, len(given), rows, size - 1), np.float32)
+    slopes = np.empty((2, len(given) if sloped else 0, rows, size - 1), np.float32)
+    box_kernels.boxes(given, of, low, high, slopes)
+    if tracks is not None:
+        box_kernels.narrow(given, flat(tracks, 2), low, high, slopes)
+    return shaped(low, shown.shape[:-2], shown), shaped(high, shown.shape[:-2], shown), slopes
+
+
 class _Boxes(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, shown: Tensor, of: box_kernels.Set, tracks: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        rows, size = shown.shape[-2:]
-        given = flat(shown, 2)
-        low, high = np.empty((2, len(given), rows, size - 1), np.float32)
-        slopes = np.empty((2, len(given) if shown.requires_grad else 0, rows, size - 1), np.float32)
-        box_kernels.boxes(given, of, low, high, slopes)
-        if tracks:
-            lower, upper, tracked = tracks
-            box_kernels.narrow(given, flat(lower, 2), flat(upper, 2), flat(tracked, 1), low, high, slopes)
+    def forward(ctx: Any, shown: Tensor, of: box_kernels.Set, tracks: Tensor | None) -> tuple[Tensor, Tensor]:
+        low, high, slopes = _bounds(shown, of, tracks, sloped=True)
         ctx.kept = slopes, shown.shape, shown.new_empty(0)
-        return shaped(low, shown.shape[:-2], shown), shaped(high, shown.shape[:-2], shown)
+        return low, high
 
     @staticmethod
     @once_differentiable
@@ -112,9 +119,10 @@ class _Boxes(torch.autograd.Function):
 
 def flat(tensor: Tensor, kept: int) -> NDArray[Any]:
     """The values [N, ...] of a tensor, with all but the last `kept` dimensions in one; numbers as float32."""
-    values = tensor.detach().cpu()
-    if values.dtype != torch.bool:
-        values = values.float()
+    values = tensor.detach()
+    # Conversions cost as much as a short loop, even where there is nothing to convert.
+    if not values.is_cpu or values.dtype not in (torch.float32, torch.bool):
+        values = values.cpu() if values.dtype == torch.bool else values.cpu().float()
     leading = tensor.ndim - kept
     if leading != 1:
         values = values.reshape(tensor.shape[:leading].numel(), *tensor.shape[leading:])
@@ -124,4 +132,7 @@ def flat(tensor: Tensor, kept: int) -> NDArray[Any]:
 
 def shaped(values: NDArray[Any], leading: torch.Size, like: Tensor) -> Tensor:
     """A tensor [*leading, ...] of values [N, ...]."""
-    return torch.from_numpy(values).to(like).reshape(*leading, *values.shape[1:])
+    made = torch.from_numpy(values)
+    if len(leading) != 1:
+        made = made.view(*leading, *values.shape[1:])
+    return made if like.is_cpu and like.dtype == made.dtype else made.to(like)

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.features import ActionType
@@ -41,23 +40,44 @@ class Ego(NamedTuple):
     edge: Tensor
 
 
+class Step(NamedTuple):
+    """A decision of the ego.
+
+    Args:
+        now: its motion before.
+        after: its state after it, [B, 7].
+    """
+
+    now: Ego
+    after: Tensor
+
+
 def stacked(ego: Ego) -> Tensor:
     """The fields of egos [N] as one tensor [N, 6], for the compiled loops; a copy without a gradient."""
     return torch.stack(tuple(ego), -1).detach().float().cpu()
 
 
-def predicted(state: TensorDictBase) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any]]:
-    """A state of N episodes for the compiled loops: the egos [N, 6], whether they are known, and their cosines and sines [N, 2].
+def reckoned(ego: Ego, known: Tensor) -> Tensor:
+    """Egos [...] as a state [..., 7]: the fields, and 1 where the ego is `known`, bool [...], else 0."""
+    return torch.stack((*ego, known.to(ego.y)), -1)
+
+
+def fields(state: Tensor) -> tuple[Ego, Tensor]:
+    """The egos [...] of a state [..., 7], and whether they are known, bool [...]."""
+    *ego, known = state.unbind(-1)
+    return Ego(*ego), known > 0
+
+
+def predicted(state: Tensor) -> tuple[NDArray[Any], NDArray[Any]]:
+    """A state of N episodes for the compiled loops, [N, 7], with the cosines and sines of the headings, [N, 2].
 
     These are torch's own functions: those of the compiled code may differ in the last bit.
     """
-    fields = dict(state.items())
-    known, egos = (
-        flat(fields["known"], 0),
-        stacked(Ego(*(fields[name] for name in Ego._fields))).view(-1, len(Ego._fields)),
-    )
-    heading = egos[:, motion_kernels.HEADING].contiguous()
-    return egos.numpy(), known, torch.stack((heading.cos(), heading.sin()), -1).numpy()
+    egos = flat(state, 1)
+    heading = torch.from_numpy(egos[:, motion_kernels.HEADING])
+    turned = np.empty((len(egos), 2), np.float32)
+    turned[:, 0], turned[:, 1] = heading.cos().numpy(), heading.sin().numpy()
+    return egos, turned
 
 
 def _middle(low: Tensor, high: Tensor) -> Tensor:
@@ -82,20 +102,17 @@ class DeadReckoning:
         self.numbers = {name: number for number, name in enumerate(actions)}
         self.order = [ORDER.index(name) for name in actions] if action_type == "discrete" else []
 
-    def unknown(self, episodes: Tensor) -> TensorDict:
-        """The state before the first observation."""
-        zero = torch.zeros(len(episodes), device=episodes.device)
-        fields = dict.fromkeys(Ego._fields, zero)
-        return TensorDict({**fields, "known": zero.bool()}, batch_size=episodes.shape)
+    def unknown(self, episodes: Tensor) -> Tensor:
+        """The state before the first observation, as of `reckoned`, [B, 7]."""
+        return torch.zeros(len(episodes), 1 + len(Ego._fields), device=episodes.device)
 
-    def now(self, boxes: Boxes, state: TensorDictBase) -> Ego:
+    def now(self, boxes: Boxes, state: Tensor) -> Ego:
         """The ego's motion at this observation: the prediction, moved into the measured row's box."""
-        width, gained = self.kinematics.lane_width, state["known"]
+        width, (ego, gained) = self.kinematics.lane_width, fields(state)
         low, high = boxes.low[..., 0, :], boxes.high[..., 0, :]
         middle = _middle(low[..., 1], high[..., 1])
         first = (middle / width).round().clamp(min=0)
         begins, start, aimed = self._first(middle, first, _middle(low[..., 2], high[..., 2]))
-        ego = Ego(*(state[name] for name in Ego._fields))
         missing = gained & (ego.y > high[..., 1] + OFF_THE_ROAD) & (ego.target_lane * width > high[..., 1])
         edge = torch.where(gained, torch.where(missing, ego.target_lane - 1, ego.edge), UNKNOWN_EDGE)
         y = torch.where(gained, torch.clamp(ego.y, low[..., 1] - SLACK, high[..., 1] + SLACK), begins)
@@ -119,27 +136,25 @@ class DeadReckoning:
         table = torch.tensor(car.target_speeds, dtype=speed.dtype, device=speed.device)
         return middle, speed, table[(speed[..., None] - table).abs().argmin(-1)]
 
-    def after(self, ego: Ego, action: Tensor) -> TensorDict:
-        """The state after an action, int64 [B] or float [B, 2]; without a gradient."""
+    def after(self, ego: Ego, action: Tensor) -> Tensor:
+        """The state [B, 7] after an action, int64 [B] or float [B, 2]; without a gradient."""
         return self._after(stacked(ego).numpy(), action, ego.y)
 
-    def step(self, boxes: Boxes, state: TensorDictBase, action: Tensor) -> tuple[Ego, TensorDict]:
+    def step(self, boxes: Boxes, state: Tensor, action: Tensor) -> Step:
         """`now`, and the state `after` an action; without a gradient, in one pass."""
         egos = np.empty((len(boxes.low), len(Ego._fields)), np.float32)
         motion_kernels.reckon(*predicted(state), flat(boxes.low, 2), flat(boxes.high, 2), self.car, egos)
         now = Ego(*torch.from_numpy(egos.T.copy()).to(boxes.low).unbind(0))
-        return now, self._after(egos, action, boxes.low)
+        return Step(now, self._after(egos, action, boxes.low))
 
-    def _after(self, egos: NDArray[Any], action: Tensor, like: Tensor) -> TensorDict:
+    def _after(self, egos: NDArray[Any], action: Tensor, like: Tensor) -> Tensor:
         """The state after an action; moves the egos [B, 6]."""
         if self.action_type == "continuous":
             motion_kernels.steered(egos, action.detach().float().cpu().contiguous().numpy(), self.car)
         else:
             orders, turns = self._changes[:, action.cpu()].numpy()
             motion_kernels.driven(egos, orders, turns, self.car)
-        moved = torch.from_numpy(egos.T.copy()).to(like)
-        fields = dict(zip(Ego._fields, moved.unbind(0), strict=True))
-        return TensorDict({**fields, "known": moved.new_ones(len(egos), dtype=torch.bool)}, batch_size=[len(egos)])
+        return torch.nn.functional.pad(torch.from_numpy(egos), (0, 1), value=1.0).to(like)
 
     @cached_property
     def _changes(self) -> Tensor:

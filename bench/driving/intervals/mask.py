@@ -11,9 +11,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from cavbench.driving.intervals import filter_kernels, margins
+from cavbench.driving.features import Features
+from cavbench.driving.intervals import filter_kernels, judge_kernels, margins
 from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.ego import predicted
+from cavbench.driving.intervals.kernels import Floats
 
 
 class Weighed(NamedTuple):
@@ -41,6 +43,19 @@ def compilable(observation: Tensor, state: TensorDictBase) -> bool:
     return state.batch_size == observation.shape[:-2]
 
 
+def facts(judge: margins.Judge, features: Features) -> judge_kernels.Facts:
+    """The world and the constants of a judge as the compiled loops take them."""
+    least, most = np.array(features.low, np.float32), np.array(features.high, np.float32)
+    single = {
+        "kept": judge.reckoning.kept,
+        "settled_m": margins.SETTLED_M,
+        "settled_rad": margins.SETTLED_RAD,
+        "clearing_m": margins.CLEARING_M,
+    }
+    numbers = {name: np.float32(value) for name, value in single.items()}
+    return judge_kernels.Facts(judge.reckoning.car, margins.PARTS, low=least, span=most - least, **numbers)
+
+
 class Mask:
     """The same as `ego.DeadReckoning.now`, `policy.corrected`, `margins.Judge` and the mask of a filter.
 
@@ -63,15 +78,17 @@ class Mask:
         """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
         return compilable(observation, state)
 
-    def __call__(self, observation: Tensor, boxes: Boxes, ego: TensorDictBase) -> Weighed:
+    def __call__(self, observation: Tensor, boxes: Boxes, ego: Tensor) -> Weighed:
         """What the filter makes of observations that it `fits`, differentiable once in them and in the boxes.
 
         Args:
             observation: as shown, [..., V, F].
             boxes: their boxes, [..., V, F - 1].
-            ego: the reckoned ego, a state as of `DeadReckoning.after`.
+            ego: the reckoned ego, a state [..., 7] as of `DeadReckoning.after`.
         """
-        return Weighed(*_Weigh.apply(observation, boxes.low, boxes.high, boxes.present, ego, self))
+        if torch.is_grad_enabled() and (observation.requires_grad or boxes.low.requires_grad):
+            return Weighed(*_Weigh.apply(observation, boxes.low, boxes.high, boxes.present, ego, self))
+        return Weighed(*_weigh(observation, boxes, ego, self)[0])
 
     def lowered(self, values: Tensor, weighed: Weighed) -> Tensor:
         """The scores [..., A], lowered for the actions that are not allowed; `values` are those of the policy behind."""
@@ -81,23 +98,15 @@ class Mask:
             return values - ((values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1) * (
                 1 - allowed
             )
-        scores: Tensor = _Lower.apply(values, weighed.margins, weighed.hard, self)
-        return scores
+        if torch.is_grad_enabled() and (values.requires_grad or weighed.margins.requires_grad):
+            scores: Tensor = _Lower.apply(values, weighed.margins, weighed.hard, self)
+            return scores
+        return _lower(values, weighed.margins, weighed.hard, self)[0]
 
     @cached_property
-    def facts(self) -> filter_kernels.Facts:
+    def facts(self) -> judge_kernels.Facts:
         """The world and the constants as the compiled loops take them."""
-        reckoning, features = self.judge.reckoning, self.assumed.features
-        least, most = np.array(features.low, np.float32), np.array(features.high, np.float32)
-        single = {
-            "kept": reckoning.kept,
-            "settled_m": margins.SETTLED_M,
-            "settled_rad": margins.SETTLED_RAD,
-            "clearing_m": margins.CLEARING_M,
-            "band": self.band,
-        }
-        numbers = {name: np.float32(value) for name, value in single.items()}
-        return filter_kernels.Facts(reckoning.car, margins.PARTS, low=least, span=most - least, **numbers)
+        return facts(self.judge, self.assumed.features)
 
     @cached_property
     def order(self) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -111,17 +120,32 @@ class Mask:
         return following.tables, following.side
 
 
+def _weigh(observation: Tensor, boxes: Boxes, ego: Tensor, of: Mask) -> tuple[tuple[Tensor, ...], judge_kernels.Kept]:
+    """The fields of `Weighed`, and what the gradient needs besides."""
+    leading, (tables, side), rooms = observation.shape[:-2], of.tables, of.judge.rooms
+    given = flat(observation, 2), flat(boxes.present, 1), *predicted(ego), flat(boxes.low, 2), flat(boxes.high, 2)
+    *found, kept = filter_kernels.weigh(*given, tables, side, rooms.asked, rooms.rules, of.facts, np.float32(of.band))
+    seen, margin, hard, safe = map(torch.from_numpy, found)
+    if len(leading) != 1:
+        seen, margin, hard, safe = (one.view(*leading, *one.shape[1:]) for one in (seen, margin, hard, safe))
+    return (seen, margin, hard, safe), kept
+
+
+def _lower(values: Tensor, margin: Tensor, hard: Tensor, of: Mask) -> tuple[Tensor, tuple[Floats, Floats]]:
+    """The lowered scores, and what the gradient needs."""
+    given, soft = flat(values, 1), flat(margin.detach().div(of.softness).sigmoid(), 1)
+    out, spread = np.empty_like(given), np.empty(len(given), np.float32)
+    filter_kernels.masked(given, flat(hard, 1), soft, of.order, out, spread)
+    return torch.from_numpy(out).view(values.shape), (soft, spread)
+
+
 class _Weigh(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any, observation: Tensor, low: Tensor, high: Tensor, present: Tensor, ego: TensorDictBase, of: Mask
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        leading, (tables, side), rooms = observation.shape[:-2], of.tables, of.judge.rooms
-        given = flat(observation, 2), flat(present, 1), *predicted(ego), flat(low, 2), flat(high, 2)
-        *found, kept = filter_kernels.weigh(*given, tables, side, rooms.asked, rooms.rules, of.facts)
-        ctx.of, ctx.kept, ctx.shape = of, kept, observation.shape
-        seen, margin, hard, safe = map(torch.from_numpy, found)
-        answers = seen.view(observation.shape), margin.view(*leading, 5), hard.view(*leading, 5), safe.view(leading)
+        ctx: Any, observation: Tensor, low: Tensor, high: Tensor, present: Tensor, ego: Tensor, of: Mask
+    ) -> tuple[Tensor, ...]:
+        answers, ctx.kept = _weigh(observation, Boxes(present, low, high), ego, of)
+        ctx.of, ctx.shape = of, observation.shape
         ctx.mark_non_differentiable(*answers[2:])
         return answers
 
@@ -139,11 +163,9 @@ class _Weigh(torch.autograd.Function):
 class _Lower(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, margin: Tensor, hard: Tensor, of: Mask) -> Tensor:
-        given, soft = flat(values, 1), flat(margin.detach().div(of.softness).sigmoid(), 1)
-        out, spread = np.empty_like(given), np.empty(len(given), np.float32)
-        filter_kernels.masked(given, flat(hard, 1), soft, of.order, out, spread)
-        ctx.of, ctx.kept, ctx.shape = of, (soft, spread), margin.shape
-        return torch.from_numpy(out).view(values.shape)
+        scores, ctx.kept = _lower(values, margin, hard, of)
+        ctx.of, ctx.shape = of, margin.shape
+        return scores
 
     @staticmethod
     @once_differentiable

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from cavbench.compiled import entry_point, inner
 from cavbench.driving.intervals.kernels import Flags, Floats
 
-Y, HEADING, SPEED, LANE, TARGET, EDGE = range(6)
-"""The fields of `cavbench.driving.intervals.ego.Ego`."""
+Y, HEADING, SPEED, LANE, TARGET, EDGE, KNOWN = range(7)
+"""The fields of `cavbench.driving.intervals.ego.Ego`, and, of a state, whether they are known."""
 
 
 SLACK = 1.0
@@ -114,13 +114,11 @@ def _nearest_target(speed: np.float32, car: Car) -> np.float32:
 
 
 @inner
-def corrected(
-    ego: Floats, known: bool, low: Floats, high: Floats, car: Car, now: Floats, turned: Floats, slopes: Floats
-) -> None:
+def corrected(ego: Floats, low: Floats, high: Floats, car: Car, now: Floats, turned: Floats, slopes: Floats) -> None:
     """`DeadReckoning.now`: fills `now` [6] and `slopes`.
 
     Args:
-        ego, known: the predicted ego [6], and whether there is one.
+        ego: the predicted ego, a state [7].
         low, high: the box of the measured row, [4].
         car: the kinematics.
         now: the ego.
@@ -130,8 +128,8 @@ def corrected(
     zero, one = np.float32(0), np.float32(1)
     slack, off, edge = np.float32(SLACK), np.float32(OFF_THE_ROAD), np.float32(UNKNOWN_EDGE)
     below, above = low[1], high[1]
-    now[:], slopes[:] = ego, zero
-    if not known:
+    now[:], slopes[:] = ego[:KNOWN], zero
+    if not ego[KNOWN] > zero:
         middle = _middle(below, above)
         first = np.rint(middle / car.lane_width)
         first = zero if first < zero else first
@@ -161,18 +159,18 @@ def corrected(
 
 
 @entry_point
-def reckon(predicted: Floats, known: Flags, turned: Floats, low: Floats, high: Floats, car: Car, egos: Floats) -> None:
+def reckon(predicted: Floats, turned: Floats, low: Floats, high: Floats, car: Car, egos: Floats) -> None:
     """The egos at an observation; fills `egos` [N, 6].
 
     Args:
-        predicted, known: the predicted egos [N, 6], and whether there is one, [N].
+        predicted: the predicted egos, states [N, 7].
         turned: cosine and sine of their headings, [N, 2]; changed where a heading is.
         low, high: the boxes, [N, V, 4], of which the ego's is read.
         car: the kinematics.
     """
     slopes = np.empty(4, np.float32)
     for n in range(len(egos)):
-        corrected(predicted[n], known[n], low[n, 0], high[n, 0], car, egos[n], turned[n], slopes)
+        corrected(predicted[n], low[n, 0], high[n, 0], car, egos[n], turned[n], slopes)
 
 
 @entry_point
@@ -275,23 +273,27 @@ def _hull(one: Motion, other: Motion) -> Motion:
 
 
 @entry_point
-def later(low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, lower: Floats, upper: Floats) -> None:
-    """The boxes of the other cars one decision later, relative to the ego; fills `lower` and `upper` [N, V - 1, 4].
+def later(present: Flags, low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, tracks: Floats) -> None:
+    """The boxes of the other cars one decision later, relative to the ego; fills `tracks` [N, V - 1, 9].
 
     Args:
+        present: the rows that are cars, [N, V].
         low, high: the boxes now, [N, V, 4]; the ego's own is not read.
-        before, after: the egos now and then, [N, 6].
+        before, after: the egos now and then, [N, 6] or states [N, 7].
         of: the limits.
-        lower, upper: the bounds of x relative to the ego, and of y, vx and vy relative to its own.
+        tracks: 1 for a car, else 0, the lower bounds and the upper ones: of x relative to the ego, and of y, vx and vy
+            relative to its own.
     """
-    zero = np.float32(0)
+    zero, one = np.float32(0), np.float32(1)
     for n in range(len(low)):
         speed, cos, sin = before[n, SPEED], np.cos(before[n, HEADING]), np.sin(before[n, HEADING])
         own_y, own_vx, own_vy = before[n, Y], speed * cos, speed * sin
         driven_x = (speed + after[n, SPEED]) / np.float32(2) * cos * of.period
         then_y = after[n, Y]
         then_vx, then_vy = after[n, SPEED] * np.cos(after[n, HEADING]), after[n, SPEED] * np.sin(after[n, HEADING])
-        for c in range(lower.shape[1]):
+        for c in range(tracks.shape[1]):
+            track = tracks[n, c]
+            track[0] = one if present[n, c + 1] else zero
             x_low, y_low = low[n, c + 1, 0], low[n, c + 1, 1] + own_y
             x_high, y_high = high[n, c + 1, 0], high[n, c + 1, 1] + own_y
             vx_low, vy_low = low[n, c + 1, 2] + own_vx, low[n, c + 1, 3] + own_vy
@@ -305,11 +307,11 @@ def later(low: Floats, high: Floats, before: Floats, after: Floats, of: Limits, 
             vy_low, vy_high = vy_low - of.turned, vy_high + of.turned
             y_low += (vy_low - aside) * of.period
             y_high += (vy_high + aside) * of.period
-            lower[n, c, 0] = x_low - driven_x - of.rounding
-            lower[n, c, 1] = y_low - then_y - of.rounding
-            lower[n, c, 2] = vx - then_vx - of.rounding
-            lower[n, c, 3] = vy_low - then_vy - of.rounding
-            upper[n, c, 0] = x_high - driven_x + of.rounding
-            upper[n, c, 1] = y_high - then_y + of.rounding
-            upper[n, c, 2] = fastest - then_vx + of.rounding
-            upper[n, c, 3] = vy_high - then_vy + of.rounding
+            track[1] = x_low - driven_x - of.rounding
+            track[2] = y_low - then_y - of.rounding
+            track[3] = vx - then_vx - of.rounding
+            track[4] = vy_low - then_vy - of.rounding
+            track[5] = x_high - driven_x + of.rounding
+            track[6] = y_high - then_y + of.rounding
+            track[7] = fastest - then_vx + of.rounding
+            track[8] = vy_high - then_vy + of.rounding

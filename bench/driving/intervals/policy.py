@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cavbench.driving.features import ActionType, DrivingFacts
 from cavbench.driving.intervals.boxes import Assumed, Boxes
-from cavbench.driving.intervals.ego import DeadReckoning, Ego
+from cavbench.driving.intervals.ego import DeadReckoning, Ego, Step
 from cavbench.driving.policy import Passed, Policy, State
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
@@ -22,6 +22,8 @@ DECISIONS = ("LANE_LEFT", "IDLE", "LANE_RIGHT", "FASTER", "SLOWER")
 
 class IntervalPolicy(Policy):
     """A policy on boxes. A tracker in front of it gives it tighter boxes than a single observation does.
+
+    Its state has the reckoned ego as `ego`, [..., 7] (`cavbench.driving.intervals.ego.reckoned`).
 
     Args:
         facts: facts of the world.
@@ -47,8 +49,8 @@ class IntervalPolicy(Policy):
         """The scores, as in `scores`, for given boxes."""
 
     @abstractmethod
-    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
-        """The state after a step, as in `advance`, for given boxes."""
+    def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
+        """The state after a step, as in `advance`, for given boxes, with what `reckoning.step` answers about the ego."""
 
     @abstractmethod
     def safe(self, boxes: Boxes, state: State) -> Tensor | None:
@@ -68,7 +70,9 @@ class IntervalPolicy(Policy):
         return self.weighed(observation, self.assumed.boxes(observation), state)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
-        return self.moved(observation, self.assumed.boxes(observation), action, state)
+        assert state is not None
+        boxes = self.assumed.boxes(observation)
+        return self.moved(observation, boxes, self.reckoning.step(boxes, state["ego"], action), action, state)
 
 
 def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
@@ -78,7 +82,9 @@ def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
         UserError: if the world does not offer what it needs.
     """
     if facts.kinematics is None:
-        raise UserError("intervals need the kinematics of cars on straight parallel lanes: this world declares none, its lanes bend or cross")
+        raise UserError(
+            "intervals need the kinematics of cars on straight parallel lanes: this world declares none, its lanes bend or cross"
+        )
     if facts.features.names != FEATURES:
         raise UserError(
             f"intervals need the features {', '.join(FEATURES)}, the world measures {', '.join(facts.features.names)}"

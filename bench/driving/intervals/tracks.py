@@ -5,12 +5,10 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
-import torch
-from tensordict import TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.intervals import motion_kernels
-from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.boxes import Boxes, flat, shaped
 from cavbench.driving.intervals.ego import Ego, stacked
 from cavbench.driving.kinematics import Kinematics
 
@@ -22,23 +20,22 @@ ROUNDING = 1e-3
 """Predicted boxes are wider by this on every side, in m and m/s."""
 
 
-def predicted(boxes: Boxes, before: Ego, after: TensorDictBase, car: Kinematics, period: float) -> dict[str, Tensor]:
-    """The boxes of the other cars one decision later, relative to the ego: `present` [B, V - 1], `low`, `high` [B, V - 1, 4].
+def predicted(boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, period: float) -> Tensor:
+    """The other cars one decision later, [B, V - 1, 9]: 1 if there is one, the lower and the upper bounds relative to the ego.
 
     Args:
         boxes: the boxes now, [B, V, 4].
         before: the ego now, [B] each.
-        after: the ego's reckoned state one decision later.
+        after: the ego's reckoned state one decision later, [B, 7].
         car: kinematics of the world's cars.
         period: seconds per decision.
     """
-    fields = dict(after.items())
-    then = Ego(*(fields[name] for name in Ego._fields))
-    low, high = (one.detach().float().cpu().contiguous().numpy() for one in (boxes.low, boxes.high))
-    lower, upper = np.empty((2, len(low), low.shape[1] - 1, low.shape[2]), np.float32)
-    motion_kernels.later(low, high, stacked(before).numpy(), stacked(then).numpy(), _limits(car, period), lower, upper)
-    present, like = boxes.present[..., 1:], boxes.low
-    return {"present": present, "low": torch.from_numpy(lower).to(like), "high": torch.from_numpy(upper).to(like)}
+    low, high = flat(boxes.low, 2), flat(boxes.high, 2)
+    tracks = np.empty((len(low), low.shape[1] - 1, 1 + 2 * low.shape[2]), np.float32)
+    motion_kernels.later(
+        flat(boxes.present, 1), low, high, stacked(before).numpy(), flat(after, 1), _limits(car, period), tracks
+    )
+    return shaped(tracks, boxes.low.shape[:-2], boxes.low)
 
 
 @cache

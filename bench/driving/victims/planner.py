@@ -5,18 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
+import numpy as np
 import torch
 from annotated_types import Interval
+from tensordict import TensorDict
 from torch import Tensor
 
 from cavbench.core.ranges import NotNegative, Share
 from cavbench.driving import ActionType, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.intervals.boxes import Boxes
-from cavbench.driving.intervals.ego import UNKNOWN_EDGE, Ego
+from cavbench.driving.intervals.ego import UNKNOWN_EDGE, Ego, Step
 from cavbench.driving.intervals.kernels import SIDES
 from cavbench.driving.intervals.margins import Judge
 from cavbench.driving.intervals.policy import IntervalPolicy
 from cavbench.driving.intervals.rooms import Caution, cars_of
+from cavbench.driving.intervals.worth import Worth
+from cavbench.driving.intervals.worth_kernels import Worths
 from cavbench.driving.threat import Norm
 
 FORBIDDEN, UNSAFE = -10.0, -2.0
@@ -78,13 +82,16 @@ class IntervalPlanner(IntervalPolicy):
         self.rules = rules
         caution = Caution(braking=rules.braking, seconds=rules.braking_s, distance=rules.distance)
         self.judge = Judge(self.reckoning, self.period, caution)
+        self.compiled = Worth(self.judge, facts.features, self._values())
 
     def initial(self, episodes: Tensor) -> State:
-        return self.reckoning.unknown(episodes)
+        return TensorDict({"ego": self.reckoning.unknown(episodes)}, batch_size=episodes.shape)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        ego = self.reckoning.now(boxes, state)
+        if self.compiled.fits(observation, state):
+            return self.compiled(boxes, state["ego"])[0]
+        ego = self.reckoning.now(boxes, state["ego"])
         cars = cars_of(ego, boxes)
         found = self.judge(ego, cars)
         left, own, right = self._worth(ego, self.judge.rooms.speeds(ego, cars)).unbind(-1)
@@ -99,12 +106,32 @@ class IntervalPlanner(IntervalPolicy):
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
-        ego = self.reckoning.now(boxes, state)
+        if self.compiled.fits(boxes.low, state):
+            return self.compiled(boxes, state["ego"])[1]
+        ego = self.reckoning.now(boxes, state["ego"])
         return self.judge(ego, cars_of(ego, boxes)).safe
 
-    def moved(self, observation: Tensor, boxes: Boxes, action: Tensor, state: State) -> State:
+    def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
         assert state is not None
-        return self.reckoning.step(boxes, state, action)[1]
+        return TensorDict({"ego": step.after}, batch_size=state.batch_size)
+
+    def _values(self) -> Worths:
+        """The constants as the compiled loops take them."""
+        rules = self.rules
+        single = {
+            "forbidden": FORBIDDEN,
+            "unsafe": UNSAFE,
+            "lane": LANE,
+            "speed": SPEED,
+            "slowest": SLOWEST,
+            "span": self.reckoning.kinematics.target_speeds[-1] - SLOWEST,
+            "per_metre": PER_METRE,
+            "tie_break": TIE_BREAK,
+            "right": rules.right,
+            "gain": rules.gain,
+            "detour": rules.detour,
+        }
+        return Worths(order=np.array(ORDER, np.float32), **{name: np.float32(value) for name, value in single.items()})
 
     def _worth(self, ego: Ego, speed: Tensor) -> Tensor:
         """[..., 3] the progress on the left, own and right lane, or on a lane beyond it less the detour."""

@@ -12,6 +12,7 @@ from cavbench.core.pair import choose
 from cavbench.driving import ObservationThreat, Oracle, Policy
 from cavbench.driving.access import Enforcer
 from cavbench.driving.dynamics import Dynamics
+from cavbench.driving.intervals.motion_kernels import SPEED
 from cavbench.driving.rollout import rollout
 from cavbench.driving.victim import CountedPolicy
 from cavbench.envs.highway.axes import AXES
@@ -76,7 +77,7 @@ def test_the_rehearsed_victim_is_the_victim_and_the_run_goes_on_from_its_own_sta
     assert after is not None
     assert imagined is not None
     assert (after == policy.advance(observation, wanted, state).expand(2, 3).reshape(6)).all()
-    imagined["ego"]["speed"] += 5
+    imagined["ego"][:, SPEED] += 5
     assert torch.equal(oracle.scores(observation), before)
     assert enforcer.spent.tolist() == [4, 4, 4]
     enforcer.close()

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cavbench.driving import ObservationThreat
 from cavbench.driving.intervals.boxes import Assumed
-from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.ego import Ego, fields
 from cavbench.driving.intervals.kernels import LEVELS_PER_UNIT, REAR_BRAKING, used
 from cavbench.driving.intervals.margins import Judge
 from cavbench.driving.intervals.policy import reckoning
@@ -93,7 +93,7 @@ def test_no_leader_that_brakes_as_assumed_is_hit(seed: int, rate: float) -> None
         gap = gap + (leader - ego.speed) * period
         leader = leader - rate * period * ((start <= step) & (step < start + 22))
         after = moves.after(ego, torch.where(stay[:, 0] >= 0, FAST, FACTS.actions.index("SLOWER")))
-        ego = Ego(*(after[name] for name in Ego._fields))
+        ego = fields(after)[0]
         assert bool((gap > 5.0)[once].all())
     assert once.float().mean() > 0.5
 
@@ -131,7 +131,7 @@ def test_no_car_behind_is_hit_after_a_lane_change_into_the_least_room(
         gap, ahead = gap + (float(ego.speed) - behind) * period, ahead + (lead - float(ego.speed)) * period
         behind = max(behind - REAR_BRAKING * period * (float(ego.y) > 1), 0.0)
         after = moves.after(ego, torch.tensor([action]))
-        ego = Ego(*(after[name] for name in Ego._fields))
+        ego = fields(after)[0]
         assert gap > 5.0
         margins = judge(ego, cars(gap, ahead))
         safe = (margins.stay[0] >= 0).nonzero().flatten().tolist()

@@ -17,7 +17,7 @@ from cavbench.defenses.driving.shield import Shield, Shielded
 from cavbench.driving import Policy
 from cavbench.driving.intervals import filter_kernels
 from cavbench.driving.intervals.boxes import Boxes
-from cavbench.driving.intervals.ego import Ego
+from cavbench.driving.intervals.ego import Ego, reckoned
 from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.victims.networks import QPolicy
 from tests.driving.intervals import by_torch as by_torch_code
@@ -72,7 +72,7 @@ def drawn(seed: int, count: int) -> tuple[Tensor, TensorDict]:
     present[: count // 8, 1:] = False
     shown = torch.cat((present.float().unsqueeze(-1), torch.where(present.unsqueeze(-1), shown.clamp(-1, 1), 0.0)), -1)
     known = among(0, 1, 1, 1) > 0
-    return shown, TensorDict({"ego": TensorDict({**ego._asdict(), "known": known}, [count])}, [count])
+    return shown, TensorDict({"ego": reckoned(ego, known)}, [count])
 
 
 def by_torch() -> AbstractContextManager[object]:
@@ -169,7 +169,7 @@ def test_boxes_within_tracks_and_their_gradients_are_those_of_torch(seed: int) -
     shift = torch.randn(100, ROWS - 1, 4, generator=generator)
     low, high = near.low[:, 1:] + shift, near.high[:, 1:] + shift * torch.rand(shift.shape, generator=generator)
     tracked = torch.rand(100, ROWS - 1, generator=generator) < 0.8
-    tracks = TensorDict({"low": low, "high": high, "present": tracked}, [100])
+    tracks = torch.cat((tracked.float().unsqueeze(-1), low, high), -1)
     asked, other = shown.clone().requires_grad_(), shown.clone().requires_grad_()
     found, wanted = assumed.boxes(asked, tracks), by_torch_code.narrowed(assumed.boxes(other), low, high, tracked)
     assert torch.equal(found.low, wanted.low)

@@ -10,6 +10,7 @@ import torch
 from cavbench import zoo
 from cavbench.core import registry
 from cavbench.driving import DrivingWorld
+from cavbench.driving.intervals.ego import fields
 from cavbench.driving.victims.attack_mix import AttackMix
 from cavbench.driving.victims.behind import Guard, GuardedPractice, defense_of
 from cavbench.driving.victims.dqn import DQN
@@ -49,7 +50,7 @@ def test_a_policy_behind_a_filter_learns_from_what_passes_it(victim: LearningDri
             executed.append((action.clamp(allowed[:, 0], allowed[:, 1]) - action).abs().max())
         restarted = step["next", "done"].squeeze(-1)
         assert practice.state is not None
-        assert torch.equal(practice.state["ego", "known"], ~restarted)
+        assert torch.equal(fields(practice.state["ego"])[1], ~restarted)
     assert recipe.action_type == "discrete" or max(executed) > 0.1
 
 
