@@ -50,6 +50,7 @@ class Kinematics:
         acceleration_limit: of the continuous action, in m/s2.
         steering_limit: of the continuous action, in rad.
         following: how other cars keep their distance.
+        oncoming: whether cars may come towards the ego, on a lane that it may use.
     """
 
     frames: int
@@ -67,3 +68,4 @@ class Kinematics:
     acceleration_limit: float
     steering_limit: float
     following: CarFollowing
+    oncoming: bool = False

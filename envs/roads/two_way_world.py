@@ -39,6 +39,8 @@ class TwoWayWorld(RoadsWorld):
     axes: ClassVar[Axes] = TWO_WAY
     grid: ClassVar[str] = TWO_WAY_V1.name
     lane_changes: ClassVar[bool] = False
+    start_speed: ClassVar[float | None] = 30.0
+    comes_towards: ClassVar[bool] = True
     home: ClassVar[Cell] = TWO_WAY.cell(density=1.0, oncoming=1.0)
     rules: ClassVar[Mapping[str, Any]] = {"task": TaskKind.TWO_WAY, "progress": Measure.LANE, "reference_speed": 30.0}
 

@@ -52,6 +52,8 @@ class RoadsWorld(DrivingWorld):
     """Whether the other cars change lanes."""
     start_speed: ClassVar[float | None] = None
     """The ego's speed at the start in m/s, if it drives on straight parallel lanes, so that a policy can predict its motion."""
+    comes_towards: ClassVar[bool] = False
+    """Whether others come towards the ego on one of these lanes."""
 
     connected: bool = True
     observed_vehicles: int = 10
@@ -89,7 +91,7 @@ class RoadsWorld(DrivingWorld):
         if self.start_speed is None:
             return None
         frames = self.simulation_frequency // self.policy_frequency
-        constants = {**KINEMATICS, "start_speed": self.start_speed}
+        constants = {**KINEMATICS, "start_speed": self.start_speed, "oncoming": self.comes_towards}
         return Kinematics(frames=frames, target_speeds=self.target_speeds, **constants)
 
     @property

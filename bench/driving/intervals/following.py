@@ -54,6 +54,8 @@ class FollowingDistance:
         braking: float | None = None,
     ) -> None:
         self.side = round(FASTEST / STEP) + 1
+        # A car that comes nearer does not stop for the ego, so it takes its speed times the seconds until then.
+        self.meeting = np.array([(period + case.within) * kinematics.oncoming for case in cases], np.float32)
         self.tables = np.stack([_table(kinematics, period, seconds, case, braking) for case in cases])
 
 

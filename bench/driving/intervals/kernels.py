@@ -47,6 +47,7 @@ class Rules(NamedTuple):
         scale: the divisor in its desired gap.
         steady: number of the option that keeps the speed.
         delay: time constant in s with which the ego slows down.
+        meeting: seconds for which a car that comes towards the ego counts, for each table; 0 where the world has none, [T].
     """
 
     period: float
@@ -61,6 +62,7 @@ class Rules(NamedTuple):
     scale: float
     steady: int
     delay: float
+    meeting: Floats
 
 
 @inner
@@ -185,6 +187,8 @@ def rooms(
                         if not asked[which, table, option]:
                             continue
                         room = gap - used(tables[table], side, own[n, option], leader, level[n, car])[0]
+                        if rules.meeting[table] > 0 and low[n, car, 2] < 0:
+                            room += low[n, car, 2] * rules.meeting[table]
                         for beside in range(3):
                             middle = nearest + beside * rules.lane_width
                             if _overlap(left, right, middle, rules.width) and room < front[n, table, beside, option]:
@@ -249,6 +253,8 @@ def rooms_backward(
                     by_low[n, car, 0] += slope
                     if low[n, car, 2] >= 0:
                         by_low[n, car, 2] += slope * (rules.period - in_leader)
+                    elif rules.meeting[table] > 0:
+                        by_low[n, car, 2] += slope * rules.meeting[table]
                     by_along[n] -= slope * rules.period
                     by_own[n, option] -= slope * in_own
             for option in range(own.shape[1]):

@@ -211,6 +211,10 @@ def steered(egos: Floats, controls: Floats, car: Car) -> None:
         egos[n, LANE] = min(lane, egos[n, EDGE])
 
 
+Motion = tuple[np.float32, np.float32, np.float32, np.float32, np.float32]
+"""Bounds of x, of vx, and how fast a car may slip sideways."""
+
+
 class Limits(NamedTuple):
     """How a car may move (`cavbench.driving.intervals.tracks`); float32.
 
@@ -220,6 +224,7 @@ class Limits(NamedTuple):
         slipping: half a car's length times the largest acceleration across, in m2/s2.
         largest_slip: sine of the largest angle between where it points and where it moves.
         rounding: by how much the boxes are wider on every side.
+        oncoming: whether a car may come towards the ego.
     """
 
     period: np.float32
@@ -228,6 +233,43 @@ class Limits(NamedTuple):
     slipping: np.float32
     largest_slip: np.float32
     rounding: np.float32
+    oncoming: bool
+
+
+@inner
+def _forward(
+    x_low: np.float32,
+    x_high: np.float32,
+    vx_low: np.float32,
+    vx_high: np.float32,
+    vy_low: np.float32,
+    vy_high: np.float32,
+    of: Limits,
+) -> Motion:
+    """One decision later: bounds of x and vx of a car that does not drive backwards, and how far it may slip sideways, in m/s."""
+    zero, one = np.float32(0), np.float32(1)
+    across = max(-vy_low, vy_high)
+    slowest = np.hypot(max(vx_low, zero), max(max(vy_low, -vy_high), zero))
+    fastest = np.hypot(vx_high, across) + of.gained
+    least = max(slowest, np.float32(0.1))
+    slip = min(of.slipping / (least * least), of.largest_slip)
+    across += of.turned
+    kept = max(slowest - of.gained, zero)
+    vx = np.sqrt(max(kept * kept - across * across, zero))
+    x_low += (vx * np.sqrt(one - slip * slip) - across * slip) * of.period
+    x_high += fastest * of.period
+    return x_low, x_high, vx, fastest, fastest * slip
+
+
+@inner
+def _hull(one: Motion, other: Motion) -> Motion:
+    return (
+        min(one[0], other[0]),
+        max(one[1], other[1]),
+        min(one[2], other[2]),
+        max(one[3], other[3]),
+        max(one[4], other[4]),
+    )
 
 
 @entry_point
@@ -256,19 +298,15 @@ def later(present: Flags, low: Floats, high: Floats, before: Floats, after: Floa
             x_high, y_high = high[n, c + 1, 0], high[n, c + 1, 1] + own_y
             vx_low, vy_low = low[n, c + 1, 2] + own_vx, low[n, c + 1, 3] + own_vy
             vx_high, vy_high = high[n, c + 1, 2] + own_vx, high[n, c + 1, 3] + own_vy
-            across = max(-vy_low, vy_high)
-            slowest = np.hypot(max(vx_low, zero), max(max(vy_low, -vy_high), zero))
-            fastest = np.hypot(vx_high, across) + of.gained
-            least = max(slowest, np.float32(0.1))
-            slip = min(of.slipping / (least * least), of.largest_slip)
-            across += of.turned
-            kept = max(slowest - of.gained, zero)
-            vx = np.sqrt(max(kept * kept - across * across, zero))
+            found = _forward(x_low, x_high, vx_low, vx_high, vy_low, vy_high, of)
+            if of.oncoming and vx_low < zero:
+                back = _forward(-x_high, -x_low, -vx_high, -vx_low, vy_low, vy_high, of)
+                mirrored = -back[1], -back[0], -back[3], -back[2], back[4]
+                found = mirrored if vx_high <= zero else _hull(found, mirrored)
+            x_low, x_high, vx, fastest, aside = found
             vy_low, vy_high = vy_low - of.turned, vy_high + of.turned
-            x_low += (vx * np.sqrt(one - slip * slip) - across * slip) * of.period
-            y_low += (vy_low - fastest * slip) * of.period
-            y_high += (vy_high + fastest * slip) * of.period
-            x_high += fastest * of.period
+            y_low += (vy_low - aside) * of.period
+            y_high += (vy_high + aside) * of.period
             track[1] = x_low - driven_x - of.rounding
             track[2] = y_low - then_y - of.rounding
             track[3] = vx - then_vx - of.rounding

@@ -82,7 +82,9 @@ def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
         UserError: if the world does not offer what it needs.
     """
     if facts.kinematics is None:
-        raise UserError("intervals need the kinematics of the world, which this world does not offer")
+        raise UserError(
+            "intervals need the kinematics of cars on straight parallel lanes: this world declares none, its lanes bend or cross"
+        )
     if facts.features.names != FEATURES:
         raise UserError(
             f"intervals need the features {', '.join(FEATURES)}, the world measures {', '.join(facts.features.names)}"

@@ -96,6 +96,7 @@ class Rooms:
             scale=model.scale,
             steady=steady,
             delay=1 / car.speed_gain,
+            meeting=following.meeting,
         )
 
     def __call__(self, ego: Ego, cars: Cars, own: Tensor, slowing: Tensor) -> tuple[Tensor, Tensor]:

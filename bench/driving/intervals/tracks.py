@@ -47,4 +47,5 @@ def _limits(car: Kinematics, period: float) -> motion_kernels.Limits:
     """
     slipping = car.length / 2 * LATERAL
     found = period, LONGITUDINAL * period, LATERAL * period, slipping, LARGEST_SLIP, ROUNDING
-    return motion_kernels.Limits(*map(np.float32, found))
+    dt, gained, turned, slid, slip, wider = map(np.float32, found)
+    return motion_kernels.Limits(dt, gained, turned, slid, slip, wider, oncoming=car.oncoming)
