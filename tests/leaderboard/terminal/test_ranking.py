@@ -62,7 +62,9 @@ def test_a_ranking_says_what_the_driven_car_does_where_a_loop_was_closed() -> No
         probed(clean, stopped=True, collided=False, drive_overrun_m=0.0),
         probed(attacked, stopped=False, collided=True, drive_overrun_m=16.0),
     )
-    texts = [printed(leaderboard_report, {"detection": pa.concat_tables(one)}, 200) for one in ((clean, attacked), loop)]
+    texts = [
+        printed(leaderboard_report, {"detection": pa.concat_tables(one)}, 200) for one in ((clean, attacked), loop)
+    ]
     assert ["in loop" in text and "collides" in text for text in texts] == [False, True]
     row = next(line for line in texts[1].splitlines() if " none " in line)
     assert row.index("0 %") < row.index("16.0") < row.index("100 %", row.index("16.0"))
