@@ -37,8 +37,6 @@ SHADOWS_IF_REHEARSED = 0.5
 SHORT, LONG = 4, 64
 """Most steps of a shadow; every second one may be long under an attack that may rehearse."""
 MOST_COPIES = 12
-EARLIER = (0, 0, 1, 2)
-"""How many questions may come before the one that is compared."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class _Question:
         place: which of the K copies of each episode is the observation that it is driven with; others are near it.
         points: [K * R, V, F].
         state: the victim's state of each point.
-        earlier: how often the same is asked before, without a look at the answer: an attack asks often in a step.
+        earlier: how often the same is asked before, without a look at the answer: a decoy may count the questions of a step.
     """
 
     path: str
@@ -116,13 +114,13 @@ class Probe:
         first = self.shadows.random() < 0.5
         with self._unseen():
             if due and self.chance.random() < 0.5:
-                before = self._ask(shown, running, state)
+                before = self._ask(shown, running, state, len(asked or ()))
             if self.shadow and first:
                 self.shadow.ask(shown)
         scores, action = self.subject.driven(shown, state, numbers)
         with self._unseen():
             if due:
-                question, answer = before or self._ask(shown, running, state)
+                question, answer = before or self._ask(shown, running, state, len(asked or ()))
                 if len(question.rows):
                     self._compare(shown, scores, action, question, answer, state)
             if self.shadow:
@@ -182,8 +180,8 @@ class Probe:
         with self._unseen():
             self.otherwise[places] += shadow.otherwise().numpy()
 
-    def _ask(self, observation: Tensor, running: Tensor, state: State) -> tuple[_Question, Tensor]:
-        """Ask about some running episodes along one of the oracle's paths."""
+    def _ask(self, observation: Tensor, running: Tensor, state: State, asked: int) -> tuple[_Question, Tensor]:
+        """Ask about some running episodes along one of the oracle's paths, after some as the attack `asked`, or none."""
         rows = running.nonzero().squeeze(-1)
         path = self.chance.choices(PATHS, PATH_WEIGHTS)[0]
         rows = _some(rows, self.chance, 1 if path == "one" else None)
@@ -191,7 +189,7 @@ class Probe:
         place = self.chance.randrange(copies)
         noise = torch.Generator().manual_seed(self.chance.getrandbits(62))
         points = near(observation[rows], copies, place, NEAR, noise)
-        earlier = self.looks.choice(EARLIER)
+        earlier = self.looks.randint(0, asked)
         question = _Question(path, rows, place, points, repeated(rows_of(state, rows), torch.Size([copies])), earlier)
         return question, self._answer(question)
 
@@ -200,16 +198,15 @@ class Probe:
         if not len(question.rows):
             return question.points
         found: list[Tensor] = []
-        with self.subject.as_asked():
-            for _ in range(question.earlier):
-                self.subject.answered(question.points, question.state, fresh(len(question.points), self.numbers))
 
         def loss(scores: Tensor) -> Tensor:
             found.append(scores.detach())
             return scores.sum(-1)
 
-        numbers = fresh(len(question.points), self.numbers)
         with self.subject.as_asked():
+            for _ in range(question.earlier):
+                self.subject.answered(question.points, question.state, fresh(len(question.points), self.numbers))
+            numbers = fresh(len(question.points), self.numbers)
             if question.path == "gradient":
                 self.subject.differentiated(question.points, question.state, loss, numbers)
             else:

@@ -175,6 +175,26 @@ def test_a_decoy_that_looks_at_random_generators_is_flagged(
     assert victim.lies == 0 or np.mean(flagged) >= 0.05
 
 
+class AfterSomeQuestions(OfAllOtherBatches):
+    """Lies from the fifth question in a row on."""
+
+    row = 0
+
+    def suspects(self, observation: Tensor) -> bool:
+        self.row = self.row + 1 if super().suspects(observation) else 0
+        return self.row > 4
+
+
+def test_a_decoy_that_counts_the_questions_of_a_step_is_flagged() -> None:
+    def ask(observation: Tensor, oracle: Oracle) -> None:
+        for _ in range(12):
+            oracle.scores(observation.expand(3, *observation.shape))
+
+    victim = AfterSomeQuestions()
+    flagged = [np.nanmean(drive(ask, victim, entropy=entropy, queries=5000)["inconsistent"]) for entropy in (0, 1)]
+    assert np.mean(flagged) >= 0.05
+
+
 @pytest.mark.parametrize("cheat", DECOYS)
 def test_a_decoy_is_flagged(cheat: type[Victim]) -> None:
     assert inconsistent(cheat()) >= 0.05
