@@ -82,9 +82,7 @@ def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
         UserError: if the world does not offer what it needs.
     """
     if facts.kinematics is None:
-        raise UserError(
-            "intervals need the kinematics of cars on straight parallel lanes: this world declares none, its lanes bend or cross"
-        )
+        raise UserError("intervals need the kinematics of cars on straight parallel lanes: this world declares none")
     if facts.features.names != FEATURES:
         raise UserError(
             f"intervals need the features {', '.join(FEATURES)}, the world measures {', '.join(facts.features.names)}"

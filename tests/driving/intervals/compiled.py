@@ -32,6 +32,34 @@ def has_the_same_bits_everywhere(answer: Answer, shown: Tensor, state: TensorDic
         assert torch.equal(slope, slopes[rows])
 
 
+def has_the_gradient_of_torch(
+    answer: Answer,
+    shown: Tensor,
+    state: TensorDict,
+    seed: int,
+    by_torch: Callable[[], AbstractContextManager[object]],
+    floor: float,
+) -> tuple[Tensor, Tensor]:
+    """A random sum of each row's scores has torch's gradient to rounding, which is a share of its largest entry and `floor`.
+
+    Both round: where large terms cancel, more of what is left is rounding. Returns how far each row is from torch's, [N], and
+    the largest entry of torch's, [N].
+    """
+    weights = torch.randn(len(shown), len(FACTS.actions), generator=torch.Generator().manual_seed(seed))
+
+    def slope() -> Tensor:
+        asked = shown.clone().requires_grad_()
+        return torch.autograd.grad((answer(asked, state) * weights).sum(), asked)[0]
+
+    compiled = slope()
+    with by_torch():
+        reference = slope()
+    largest = reference.abs().flatten(1).amax(1)
+    apart = (compiled - reference).abs().flatten(1).amax(1)
+    assert bool((apart <= 1e-5 * (largest + floor)).all())
+    return apart, largest
+
+
 def takes_several_dimensions_and_none(answer: Answer, shown: Tensor, state: TensorDict) -> None:
     """60 rows, as 4 x 15, and no row at all."""
     flat = answer(shown, state)

@@ -18,6 +18,7 @@ from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.victims.networks import QPolicy
 from tests.driving.intervals.compiled import (
     drives_as_by_torch,
+    has_the_gradient_of_torch,
     has_the_same_bits_everywhere,
     takes_several_dimensions_and_none,
 )
@@ -81,20 +82,8 @@ def test_points_are_those_of_torch_to_the_last_bit(seed: int, any_start: bool) -
 def test_gradients_are_those_of_torch(seed: int, any_start: bool, network: bool) -> None:
     policy = believing(None if network else Points(), any_start=any_start)
     shown, state = drawn(seed, 200)
-    weights = torch.randn(200, len(FACTS.actions), generator=torch.Generator().manual_seed(seed))
-
-    def slope() -> Tensor:
-        asked = shown.clone().requires_grad_()
-        return torch.autograd.grad((policy.scores(asked, state) * weights).sum(), asked)[0]
-
-    compiled = slope()
-    with by_torch():
-        reference = slope()
-    largest = reference.abs().flatten(1).amax(1)
+    _, largest = has_the_gradient_of_torch(policy.scores, shown, state, seed, by_torch, floor=0.1)
     assert float(largest.median()) > 0.01
-    apart = (compiled - reference).abs().flatten(1).amax(1)
-    # Where large terms cancel, more of what is left is rounding.
-    assert bool((apart <= 1e-5 * (largest + 0.1)).all())
 
 
 def test_a_row_has_the_same_bits_in_every_batch_and_place() -> None:
