@@ -19,6 +19,7 @@ from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.detection.detector import STOP_SIGN, Detector, Predictions, label_of
 from cavbench.detection.reports import Reports
 from cavbench.detection.threat import PatchThreat
+from cavbench.isolation.modes import Modes
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import TamperError, Watch
 
@@ -132,7 +133,7 @@ class PatchEnforcer:
     ) -> None:
         self.detector, self.access = detector, access
         self.threat = deepcopy(threat)
-        self.watch, self.stream = watch, stream
+        self.watch, self.stream, self._modes = watch, stream, Modes()
         self.spent = self.backwards = self.zeros = self.nans = self._evaluated = 0
         self.reports = reports or Reports(self.threat)
         self.oracle = PatchOracle(
@@ -151,13 +152,16 @@ class PatchEnforcer:
         """Let the attack craft: with its own random numbers, and with an eye on the detector.
 
         Raises:
-            TamperError: if it reached the detector past the oracle, or changed the counts.
+            TamperError: if it reached the detector past the oracle, changed the counts, or left a mode of torch on.
         """
+        differentiates = torch.is_grad_enabled()
         self._switch(True)
         try:
             yield
         finally:
             self._switch(False)
+            torch.set_grad_enabled(differentiates)
+        self._modes.settle("attack")
         if self.spent != self._evaluated:
             raise TamperError("the attack changed the count of its queries", "attack")
         if self.watch and self.watch.strays:
@@ -183,7 +187,9 @@ class PatchEnforcer:
         if away:
             self._switch(False)
         try:
-            yield self.detector
+            with self._modes.for_victim():
+                yield self.detector
+                self._modes.settle("defense")
         finally:
             if away:
                 self._switch(True)
