@@ -17,6 +17,7 @@ from torch import Tensor
 
 from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.detection.detector import STOP_SIGN, Detector, Predictions, label_of
+from cavbench.detection.half import Precision, computing_in, in_full
 from cavbench.detection.reports import Reports
 from cavbench.detection.threat import PatchThreat
 from cavbench.isolation.modes import Modes
@@ -74,13 +75,19 @@ class PatchOracle:
             # The detector gets a copy: one that writes to its input would change the attack's images.
             return detector(pictures.clone())
 
-    def differentiable(self, pictures: Tensor) -> Predictions:
-        """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`."""
-        with self._enforcer.asked("gradients", len(pictures)) as detector:
+    def differentiable(self, pictures: Tensor, precision: Precision = "float32") -> Predictions:
+        """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`.
+
+        Args:
+            pictures: the images.
+            precision: of the convolutions and products of matrices; patches are scored in float32 always.
+        """
+        with self._enforcer.asked("gradients", len(pictures)) as detector, computing_in(precision, detector):
             asked = pictures.clone()
             if asked.requires_grad:
                 asked.register_hook(self._enforcer.cleaned)
-            return detector(asked)
+            found = detector(asked)
+        return found if precision == "float32" else in_full(found)
 
     def aggregate(self, scores: Tensor) -> Tensor:
         """[..., F] what the detector reports of a sign with the scores [..., F] in the frames of an approach, in driving order.
