@@ -6,7 +6,7 @@
 # Versions: gymnasium 1.4.0 (wrappers/stateful_action.py, StickyAction.action; `np_random` of a wrapper is that of its environment).
 # SuperSuit's sticky_actions_v0 has a generator of its own. Source: a robustness curve that began with probability 0.
 source "$(dirname "$0")/fresh.sh"
-fresh gymnasium==1.4.0 SuperSuit==3.11.0 numpy
+fresh gymnasium==1.4.0 SuperSuit==3.11.0 pettingzoo==1.27.0 numpy
 see <<'P'
 import gymnasium
 import supersuit
