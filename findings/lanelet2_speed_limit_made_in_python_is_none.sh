@@ -3,7 +3,7 @@
 # What happens: it is a TrafficSign that Python calls a SpeedLimit. The traffic rules of Germany do not see it: 100 km/h instead of 30. It is
 # written to a file as a traffic sign, so the limit is lost there, too. A tag `speed_limit` on the lanelet, or a file made by hand, has it.
 # For whom it matters: in maps that are generated for tests, cars that exceed the limit by 70 km/h obey it.
-# Versions: lanelet2 1.2.3 (Python constructor SpeedLimit in lanelet2.core, GermanVehicle::speedLimit in lanelet2_traffic_rules).
+# Versions: lanelet2 1.2.3 (lanelet2_python, core.cpp: the constructor of SpeedLimit calls TrafficSign::make; GermanVehicle::speedLimit casts).
 # Source: limits of generated lanelets, beside those of the same map after it was written and read.
 source "$(dirname "$0")/fresh.sh"
 fresh lanelet2==1.2.3

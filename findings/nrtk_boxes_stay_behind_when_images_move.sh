@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # One guesses: nrtk moves the boxes of an image with its pixels, and cuts them at the border of the image.
 # What happens: after a translation boxes are cut at their own old right and lower edge. A car that moves right or down has a part of its box,
-# down to a box without area. After a crop the boxes are taken as (row, column), and everything else takes them as (x, y).
+# down to a box without area. A crop takes boxes as (row, column); translation, distortion and nrtk's MAITE interface take (x, y).
 # For whom it matters: a detector that finds every car loses precision and recall by the translation itself, and looks less robust.
 # Versions: nrtk 1.1.0 (impls/perturb_image/geometric/_random: RandomTranslationPerturber.perturb, RandomCropPerturber._compute_bboxes),
 # smqtk-image-io 0.19.0. Source: the pixels of a white car on black, beside the box that is returned for it.
