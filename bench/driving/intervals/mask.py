@@ -183,7 +183,7 @@ def _score(
     passed = torch.from_numpy(seen)
     values, behind = network.forward(passed, keeps=sloped and network.keeps(passed))
     scores, lowered = of.lower(values, torch.from_numpy(margins), torch.from_numpy(hard))
-    return scores.view(*observation.shape[:-2], -1), (slopes, kept, behind, lowered)
+    return scores.view(*observation.shape[:-2], network.outputs), (slopes, kept, behind, lowered)
 
 
 class _Weigh(torch.autograd.Function):
