@@ -70,9 +70,7 @@ class Assumed:
             low, high = (shaped(one, shown.shape[:-2], shown) for one in self.bounds(*_flat(shown, tracks))[:2])
         return Boxes(shown[..., 0] > 0, low, high)
 
-    def bounds(
-        self, shown: Floats, tracks: Floats | None, *, sloped: bool = False
-    ) -> tuple[Floats, Floats, Floats]:
+    def bounds(self, shown: Floats, tracks: Floats | None, *, sloped: bool = False) -> tuple[Floats, Floats, Floats]:
         """`boxes` on arrays: the bounds, [N, V, F - 1] each, and how both change with the shown values, if wanted.
 
         Args:
