@@ -101,6 +101,10 @@ class Fused:
             return answer
         return self.forward(observation, keeps=False)[0]
 
+    def keeps(self, observation: Tensor) -> bool:
+        """Whether a pass whose gradient may be asked for keeps what that needs."""
+        return observation.shape[: -self.dimensions].numel() <= MANY
+
     def forward(self, observation: Tensor, *, keeps: bool) -> tuple[Tensor, Any]:
         """The answers [..., A], and what the gradient needs besides them (`kernels.forward`)."""
         leading = observation.shape[: -self.dimensions]
@@ -114,6 +118,29 @@ class Fused:
         given = points, weights, self.form(points.shape[1]), self.widths, self.kinds
         kernels.forward(*given, out, kept, best, chosen)
         return torch.from_numpy(out).view(*leading, self.outputs), (*given, kept, best, chosen)
+
+    def backward(self, kept: Any, by_answer: Tensor) -> kernels.Floats:
+        """The gradient in the points [N, n], from that in the answers [..., A] and what `forward` gave besides them."""
+        points = kept[0]
+        by_out = by_answer.detach().reshape(len(points), self.outputs).contiguous().numpy()
+        asked = np.flatnonzero(by_out.any(1))
+        # A second pass forward costs as much as one backward.
+        if len(points) <= len(kept[-1]) * kernels.LANES and 2 * len(asked) > len(points):
+            by_points = np.empty_like(points)
+            kernels.backward(*kept, by_out, by_points)
+            return by_points
+        found = np.zeros_like(points)
+        if len(asked):
+            some = torch.from_numpy(points[asked])
+            again = self.forward(some.view(-1, *self._shape(points.shape[1])), keeps=True)[1]
+            by_points = np.empty_like(again[0])
+            kernels.backward(*again, by_out[asked], by_points)
+            found[asked] = by_points
+        return found
+
+    def _shape(self, size: int) -> tuple[int, ...]:
+        """The shape of an observation of `size` values."""
+        return (size // self.features, self.features) if self.width else (size,)
 
     def gathered(self) -> Tensor:
         """All weights in one vector, in the order of `kernels.forward`; the parameters become views of it."""
@@ -179,26 +206,10 @@ class _Pass(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, observation: Tensor, network: Fused) -> Tensor:
         ctx.shape, ctx.network = observation.shape, network
-        ctx.lean = observation.shape[: -network.dimensions].numel() > MANY
-        answer, ctx.kept = network.forward(observation, keeps=not ctx.lean)
+        answer, ctx.kept = network.forward(observation, keeps=network.keeps(observation))
         return answer
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_answer: Tensor) -> tuple[Tensor, None]:
-        points, network = ctx.kept[0], ctx.network
-        by_out = by_answer.detach().reshape(len(points), network.outputs).contiguous()
-        asked = by_out.any(1).nonzero().squeeze(1)
-        # A second pass forward costs as much as one backward.
-        if not ctx.lean and 2 * len(asked) > len(points):
-            by_points = np.empty_like(points)
-            kernels.backward(*ctx.kept, by_out.numpy(), by_points)
-            return torch.from_numpy(by_points).view(ctx.shape), None
-        found = torch.zeros(points.shape)
-        if len(asked):
-            some = torch.from_numpy(points)[asked]
-            kept = network.forward(some.view(-1, *ctx.shape[len(ctx.shape) - network.dimensions :]), keeps=True)[1]
-            by_points = np.empty_like(kept[0])
-            kernels.backward(*kept, by_out[asked].numpy(), by_points)
-            found[asked] = torch.from_numpy(by_points)
-        return found.view(ctx.shape), None
+        return torch.from_numpy(ctx.network.backward(ctx.kept, by_answer)).view(ctx.shape), None

@@ -56,6 +56,10 @@ class IntervalPolicy(Policy):
     def safe(self, boxes: Boxes, state: State) -> Tensor | None:
         """Whether an action has a margin of at least 0, bool [...]; None if it promises nothing."""
 
+    def answered(self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, state: State) -> Tensor:
+        """The scores, as in `scores`, with the boxes of a set and of an estimator's tracks (`Assumed.boxes`)."""
+        return self.weighed(observation, assumed.boxes(observation, tracks), state)
+
     def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
         """As `passed`, for given boxes."""
         return Passed(observation)
@@ -67,7 +71,7 @@ class IntervalPolicy(Policy):
         return self.safe(self.assumed.boxes(observation), state)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
-        return self.weighed(observation, self.assumed.boxes(observation), state)
+        return self.answered(observation, self.assumed, None, state)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None

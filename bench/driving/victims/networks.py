@@ -123,6 +123,18 @@ class QPolicy(Policy):
         return self.scores(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
+def compiled(policy: Policy, observation: Tensor) -> Fused | None:
+    """The compiled network whose answers about observations [..., V, F] are the scores of a policy; None if torch answers."""
+    if type(policy).scores is not Policy.scores or type(policy).forward is not QPolicy.forward:
+        return None
+    if "forward" in vars(policy) or "scores" in vars(policy) or policy._forward_pre_hooks or policy._forward_hooks:
+        return None
+    network: object = policy.network
+    if not isinstance(network, QNetwork) or network.training:
+        return None
+    return network.fused if network.fused.fits(observation) else None
+
+
 class Actor(nn.Module):
     """mu(s): acceleration and steering [..., 2] within +-limit, from an observation [..., V, F]."""
 
