@@ -58,9 +58,11 @@ class Tracked(PolicyWrapper):
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None
         inner = state.get("inner", None)
-        if isinstance(self.policy, IntervalPolicy):
-            return self.policy.answered(observation, self.assumed, state.get("tracks", None), inner)
-        return self.policy.scores(self._estimate(observation, self.boxes(observation, state), state), inner)
+        if not isinstance(self.policy, IntervalPolicy):
+            return self.policy.scores(self._estimate(observation, self.boxes(observation, state), state), inner)
+        if type(self).boxes is not Tracked.boxes:
+            return self.policy.weighed(observation, self.boxes(observation, state), inner)
+        return self.policy.answered(observation, self.assumed, state.get("tracks", None), inner)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None

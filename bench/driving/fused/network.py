@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
@@ -30,26 +31,41 @@ class Fused:
 
     Its answers are those of torch to about 1e-6, and the same to the last bit in every batch. It reads the weights anew in
     every call. It answers only where nothing else can be wanted of the network than its output and the gradient in its input
-    (`fits`): torch trains, exports and runs hooks.
+    (`fits`): torch trains, exports, runs hooks, and computes whatever was changed in the network since it was built.
 
     Args:
+        network: the network, with all that it is made of.
         layers: linear layers with bias, each with what follows it: `ReLU`, `Tanh` or nothing.
         encoder: its layers `car`, `ego` and `pair`; None for a network that reads all values of an observation.
         dueling: whether the outputs are a state value and advantages.
         scale: factors of the outputs [A]; None for 1.
     """
 
-    marked: ClassVar[tuple[str, ...]] = ("modules", "scale", "widths", "kinds", "last", "outputs", "features", "size")
+    marked: ClassVar[tuple[str, ...]] = (
+        "modules",
+        "scale",
+        "widths",
+        "kinds",
+        "last",
+        "outputs",
+        "features",
+        "size",
+        "built",
+    )
     """What the watch compares (`cavbench.isolation.watch.marks`)."""
 
     def __init__(
         self,
+        network: nn.Module,
         layers: Sequence[tuple[nn.Linear, type[nn.Module] | None]],
         *,
         encoder: tuple[nn.Linear, nn.Linear, nn.Linear] | None = None,
         dueling: bool = False,
         scale: Tensor | None = None,
     ) -> None:
+        self.built = tuple(
+            (one, type(one), tuple(one._modules.values()), tuple(one._buffers.values())) for one in network.modules()
+        )
         linears, kinds = zip(*layers, strict=True)
         self.modules: tuple[nn.Linear, ...] = (*(encoder or ()), *linears)
         self.scale = scale
@@ -76,9 +92,19 @@ class Fused:
         shape = observation.shape
         if shape[-1] != self.size or (self.width and shape[-2] < 2) or torch._C._are_functorch_transforms_active():
             return False
-        for module in self.modules:
-            # Hooks count who evaluates the network past the oracle.
-            if module._forward_pre_hooks or module._forward_hooks or module._backward_hooks:
+        for module, kind, children, buffers in self.built:
+            own = module.__dict__
+            # Hooks count who evaluates the network past the oracle, or are of a defence.
+            if (
+                own["_forward_pre_hooks"]
+                or own["_forward_hooks"]
+                or own["_backward_hooks"]
+                or own["_backward_pre_hooks"]
+            ):
+                return False
+            if type(module) is not kind or "forward" in own or tuple(own["_modules"].values()) != children:
+                return False
+            if own["_buffers"] and not all(map(operator.is_, own["_buffers"].values(), buffers)):
                 return False
         weights = self._weights()
         if any(weight.requires_grad for weight in weights):
@@ -190,7 +216,7 @@ def chain(network: object) -> Fused | None:
             found[-1] = found[-1][0], kind
         else:
             return None
-    return Fused(found) if found else None
+    return Fused(network, found) if found and isinstance(network, nn.Module) else None
 
 
 def _flat(network: object) -> Iterator[Any]:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cavbench.defenses.driving import shield
 from cavbench.defenses.driving.shield import Shield, Shielded
-from cavbench.driving import Policy
+from cavbench.driving import Policy, State
 from cavbench.driving.intervals import filter_kernels
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego, reckoned
@@ -210,6 +210,16 @@ def test_one_node_has_the_same_bits_in_every_batch_and_dimension() -> None:
     policy = shielded()
     has_the_same_bits_everywhere(policy.scores, *drawn(1, 120))
     takes_several_dimensions_and_none(policy.scores, *drawn(2, 60))
+
+
+def test_a_shield_that_weighs_otherwise_is_asked() -> None:
+    class Halved(Shielded):
+        def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
+            return super().weighed(observation, boxes, state) / 2
+
+    usual, (shown, state) = shielded(), drawn(3, 40)
+    halved = Halved(Shield(), usual.policy, FACTS)
+    assert torch.equal(halved.scores(shown, state), usual.scores(shown, state) / 2)
 
 
 def test_a_tracked_filter_drives_as_by_torch() -> None:
