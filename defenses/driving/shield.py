@@ -112,7 +112,8 @@ class Shielded(Filter):
     def answered(self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, state: State) -> Tensor:
         assert state is not None
         network = compiled(self.policy, observation)
-        if network is None or not self.mask.fits(observation, state):
+        # What weighs otherwise is no mask in front of a network.
+        if network is None or type(self).weighed is not Shielded.weighed or not self.mask.fits(observation, state):
             return super().answered(observation, assumed, tracks, state)
         return self.mask.scores(observation, assumed, tracks, state["ego"], network)
 
