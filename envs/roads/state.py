@@ -205,6 +205,7 @@ class Parameters(Protocol):
     full_steps: int  # `max_steps` of the world, also in a planner's copies
     action_repeat: int
     actions: Integers  # the five discrete actions, by the task's numbers
+    choices: int  # how many numbers the task has
     layout: int  # `ViewKind`
     horizon: int  # steps of a grid of times to collision
     speeds: int  # number of target speeds
