@@ -7,18 +7,19 @@ comments in sysdeps/ieee754/dbl-64), "seen" the worst of 3 million arguments in 
 
 | function | stated | seen | assumed |
 |---|---|---|---|
-| `asin` | 0.013 below 0.125, 0.024 to 0.5, 0.005 to 0.75 | 0.0103, 0.0153, 0.0038 | 0.02 below 0.124, then 0.028, halved from 0.25 on |
-| `tan` | 0.004 to 0.0608, 0.10 to 0.787, 0.12 beyond | 0.0026, 0.068, 0.0122 | 0.006, then 0.12, halved from 0.125 on, 0.03 from 0.98 on |
-| `atan` | 0.011 below 1/16, 0.06 to 1, 0.003 beyond | 0.0077, 0.0217, 0.0035 | 0.013, then 0.07, halved from 0.125 on |
-| `sin` | 0.001 below 0.126, 0.018 beyond | 0.0076, 0.0155 | 0.012 below 0.124, then 0.028, halved from 0.25 on |
+| `asin` | 0.013 below 0.125, 0.024 to 0.5, 0.005 to 0.75 | 0.0103, 0.0153, 0.0038 | 0.015 below 0.124, then 0.025, halved from 0.25 on |
+| `tan` | 0.004 to 0.0608, 0.10 to 0.787, 0.12 beyond | 0.0026, 0.068, 0.0122 | 0.006, then 0.1, halved from 0.125 on, 0.02 from 0.98 on |
+| `atan` | 0.011 below 1/16, 0.06 to 1, 0.003 beyond | 0.0077, 0.0217, 0.0035 | 0.012, then 0.06, halved from 0.125 on |
+| `sin` | 0.001 below 0.126, 0.018 beyond | 0.0076, 0.0155 | 0.012 below 0.124, then 0.02, halved from 0.25 on |
 
-"Halved" is once a power of two of the result: from there on glibc adds a small correction to a number of a table, and the error
-is that of the correction, so in ulp of the result it falls. A C library that is wrong by more is not always followed to the last
-bit. A search for the worst arguments of glibc found 0.016, 0.119, 0.023 and 0.016 (Innocente and Zimmermann, "Accuracy of
-Mathematical Functions in Single, Double, Double Extended, and Quadruple Precision").
+Limits are those of results. "Halved" is at that result and at each later power of two: there glibc adds a small correction to a
+number of a table, and the error is that of the correction, so in ulp of the result it falls. The second row's last column is
+"seen" up to pi / 3 only. A search for the worst arguments of glibc found totals of 0.516, 0.619, 0.523 and 0.516 (Innocente and
+Zimmermann, "Accuracy of Mathematical Functions in Single, Double, Double Extended, and Quadruple Precision"). A C library that is
+wrong by more is not always followed to the last bit.
 
-Values are pairs: a number and a small correction, which together have at least 63 bits. They are Taylor polynomials about the
-points of a table, whose constant and linear terms are pairs.
+Values are pairs: a number and a small correction, which together have at least 63 bits. They come from Taylor polynomials about
+the points of a table, whose constant and linear terms are pairs.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ STEPS, LAST = 128, 91
 """Points of the table per unit of the sine, and its last one: up to 0.714."""
 DEGREE, ORDER = 10, 32
 """Of the polynomials, and of the series from which a point of the table follows from the one before."""
-SLIP, TANGENT, STEERING, SHARES = 0, DEGREE + 3, 2 * (DEGREE + 3), 3 * (DEGREE + 3)
-"""First columns of the three functions, and of the shares of doubt of the six that `steered` rounds."""
+SLIP, STEERING, SHARES = 0, DEGREE + 3, 2 * (DEGREE + 3)
+"""First columns of the two functions, and of the shares of doubt of the six that `steered` rounds."""
 TINY = 1e-100
 """The corrections of smaller angles would be denormal."""
 
@@ -71,7 +72,7 @@ def _share(assumed: tuple[float, float, float, float], low: float, high: float) 
 
 def _shares(point: int) -> list[float]:
     """The shares of doubt of the six functions in `steered` about a point."""
-    sines = max(point - 0.5, 0.0) / STEPS, (point + 0.5) / STEPS
+    sines = max(point - 0.5, 0.0) / STEPS, (point + 0.502) / STEPS
     slips = [math.asin(sine) for sine in sines]
     tangents = [math.tan(slip) for slip in slips]
     doubles = [2.0 * tangent for tangent in tangents]
@@ -100,10 +101,10 @@ def _step(series: Sequence[int]) -> int:
 
 
 def _table() -> NDArray[np.float64]:
-    """[K, 45] polynomials of three functions of a sine s about k / `STEPS`, and shares of doubt.
+    """[K, 32] polynomials of two functions of a sine s about k / `STEPS`, and shares of doubt.
 
-    The functions are asin(s), its tangent s w with w = (1 - s^2)^(-1/2), and atan(2 s w). The derivative of the first is w, that of the
-    last 2 w / (1 + 3 s^2), so all series follow from that of w.
+    The functions are asin(s) and atan(2 tan(asin(s))). The derivative of the first is w = (1 - s^2)^(-1/2), that of the second
+    2 w / (1 + 3 s^2), so both series follow from that of w.
     """
     one, slip, steering, rows = 1 << BITS, 0, 0, []
     for point in range(LAST + 1):
@@ -116,13 +117,18 @@ def _table() -> NDArray[np.float64]:
             rate.append((2 * w[n + 1] * one - 6 * s * rate[n] - 3 * one * rate[n - 1]) // (one + 3 * square))
         slips = [slip, *(value // n for n, value in enumerate(w[1:], 1))]
         steerings = [steering, *(value // n for n, value in enumerate(rate[1:], 1))]
-        tangents = [((s * w[n + 1]) >> BITS) + w[n] for n in range(ORDER)]
-        rows.append(_row(slips) + _row(tangents) + _row(steerings) + _shares(point))
+        rows.append(_row(slips) + _row(steerings) + _shares(point))
         slip, steering = slip + _step(slips), steering + _step(steerings)
     return np.array(rows)
 
 
 TABLE = _table()
+
+
+@inlined
+def nearest_point(sine: float) -> int:
+    """The point of the table next to a sine, which is more than half of that of point 1: their difference is exact."""
+    return int(sine * STEPS + 0.499)
 
 
 @inlined
@@ -152,6 +158,18 @@ def is_decided(high: float, low: float, share: float) -> bool:
     return high + (low - doubt) == high + (low + doubt)
 
 
+@inlined
+def tangent_pair(sine: float) -> tuple[float, float, float]:
+    """The pair of sine / cosine, by one Newton step for the root and one for the quotient; and the cosine."""
+    square = 1.0 - sine * sine
+    rest = fused(-sine, sine, 1.0 - square)
+    cosine = math.sqrt(square)
+    inverse = 1.0 / cosine
+    cosine_low = 0.5 * inverse * (fused(-cosine, cosine, square) + rest)
+    tangent = sine * inverse
+    return tangent, inverse * (fused(-tangent, cosine, sine) - tangent * cosine_low), cosine
+
+
 @borrowing
 def steered(sine: float) -> tuple[float, float, float]:
     """The angles of a bicycle whose slip angle shall have a sine in [-0.71, 0.71], with the C library's bits.
@@ -167,10 +185,10 @@ def steered(sine: float) -> tuple[float, float, float]:
         d = c_atan(2.0 * c_tan(c_asin(sine)))
         b = c_atan(0.5 * c_tan(d))
         return d, b, c_sin(b)
-    point = int(s * STEPS + 0.5)
+    point = nearest_point(s)
     off = s - point / STEPS
+    tangent, tangent_low, cosine = tangent_pair(s)
     slip, slip_low = evaluated(point, SLIP, off)
-    tangent, tangent_low = evaluated(point, TANGENT, off)
     steering, steering_low = evaluated(point, STEERING, off)
     # Derivatives: 1 / cos^2(slip), and 1 / (1 + 4 tan^2(slip)) = cos^2(slip) / (1 + 3 sin^2(slip)).
     square = 1.0 - s * s
@@ -196,7 +214,7 @@ def steered(sine: float) -> tuple[float, float, float]:
     b = slip + low
     if not is_decided(slip, low, TABLE[point, SHARES + 4]):
         b = c_atan(u)
-    low = ((b - slip) - slip_low) * math.sqrt(square)
+    low = ((b - slip) - slip_low) * cosine
     sine_b = s + low
     if not is_decided(s, low, TABLE[point, SHARES + 5]):
         sine_b = c_sin(b)
