@@ -120,7 +120,8 @@ def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least
     """
     if lane.kind == CIRCULAR:
         off_x, off_y = x - lane.center_x, y - lane.center_y
-        square, inside, outside = off_x * off_x + off_y * off_y, lane.radius - least - SURELY, lane.radius + least + SURELY
+        square = off_x * off_x + off_y * off_y
+        inside, outside = lane.radius - least - SURELY, lane.radius + least + SURELY
         if square > outside * outside or (inside > 0.0 and square < inside * inside):
             return np.inf, 0.0, 0.0
         across = lane.turn * (lane.radius - math.sqrt(square))

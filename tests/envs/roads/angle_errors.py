@@ -7,6 +7,7 @@ prints the largest errors in ulp of the six functions that `steered` replaces, f
 
 from __future__ import annotations
 
+import itertools
 import sys
 
 import numpy as np
@@ -74,6 +75,6 @@ def measured(sines: Floats) -> tuple[Floats, Floats]:
 if __name__ == "__main__":
     SINES = int(sys.argv[1]) if len(sys.argv) > 1 else 3_000_000
     sys.stdout.write(f"{'sine':<16}" + "".join(f"{name:>10}" for name in FUNCTIONS) + "\n")
-    for low, high in zip(EDGES, EDGES[1:], strict=False):
+    for low, high in itertools.pairwise(EDGES):
         worst = measured(np.random.default_rng(0).uniform(low, high, SINES))[0].max(0)
         sys.stdout.write(f"{low:<8g}{high:<8g}" + "".join(f"{error:10.4f}" for error in worst) + "\n")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import math
 from collections.abc import Callable
 from decimal import Decimal, localcontext
@@ -87,7 +88,8 @@ def test_small_sines_and_those_of_few_digits_too() -> None:
 def with_doubt(factor: float) -> Callable[[Floats, Floats], None]:
     """`steer` of a copy of the module whose doubts are multiplied."""
     spec = importlib.util.spec_from_file_location("angles_copy", Path(angles.__file__))
-    assert spec and spec.loader
+    assert spec is not None
+    assert spec.loader is not None
     copy: Any = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(copy)
     copy.TABLE[:, copy.SHARES :] *= factor
@@ -108,7 +110,7 @@ def test_with_less_doubt_bits_differ(factor: float) -> None:
 
 
 def test_the_c_library_is_not_wrong_by_more_than_is_assumed() -> None:
-    for number, (low, high) in enumerate(zip(EDGES, EDGES[1:], strict=False)):
+    for number, (low, high) in enumerate(itertools.pairwise(EDGES)):
         errors, assumed = measured(np.random.default_rng(number).uniform(low, high, NUMBER // 10))
         assert (errors < assumed).all(), (low, high)
         # Some results are close to the middle of two numbers, otherwise nothing would be in doubt.
