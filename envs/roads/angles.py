@@ -2,9 +2,9 @@
 
 highway-env's angles come from the C library. Its functions are wrong by little more than half a unit in the last place (ulp).
 So a value with ten more bits decides which number they return, unless it lies close to the middle of two numbers. There the C
-library is asked. "Assumed" is what it may be wrong by besides the rounding, in ulp. "Stated" is what glibc's sources say (2.28
-and later, comments in sysdeps/ieee754/dbl-64). "Seen" is the worst of 3 million arguments in each of 22 intervals with glibc 2.36, by
-`python -m tests.envs.roads.angle_errors`:
+library is asked. "Assumed" is what it may be wrong by besides the rounding, in ulp. "Stated" is what glibc's sources say
+(comments in sysdeps/ieee754/dbl-64; older versions round correctly). "Seen" is the worst of 3 million arguments in each of 22
+intervals with glibc 2.36, by `python -m tests.envs.roads.angle_errors`:
 
 | function | stated | seen | assumed |
 |---|---|---|---|
@@ -14,9 +14,8 @@ and later, comments in sysdeps/ieee754/dbl-64). "Seen" is the worst of 3 million
 | `sin` | 0.001 below 0.126, 0.018 beyond | 0.0077, 0.0155 | 0.012 to 0.124, 0.02, halved from 0.25 |
 
 Limits are those of results. "Halved" is at that result and at each later power of two: there glibc adds a small correction to a
-number of a table, and the error is that of the correction, so in ulp of the result it falls. A search for the worst arguments of
-glibc found totals of 0.516, 0.619, 0.523 and 0.516 (Innocente and Zimmermann, "Accuracy of Mathematical Functions in Single,
-Double, Double Extended, and Quadruple Precision"). A C library that is wrong by more is not always followed to the last bit.
+number of a table, and the error is that of the correction, so in ulp of the result it falls. That is seen, but not stated. A C
+library that is wrong by more is not always followed to the last bit.
 
 Values are pairs: a number and a small correction, which together have at least 63 bits. They come from Taylor polynomials about
 the points of a table, whose constant and linear terms are pairs.
