@@ -229,6 +229,7 @@ def parameters(config: RoadsConfig) -> NDArray[np.void]:
     values["speeds"], values["columns"] = len(config.target_speeds), len(config.features)
     values["target_speeds"][: len(config.target_speeds)] = config.target_speeds
     values["actions"][: len(config.actions)] = config.actions
+    values["choices"] = len(config.actions)
     values["horizon"] = int(config.horizon / values["period"])
     values["regulation"] = int(1 / values["dt"] / REGULATIONS) if config.regulated else 0
     values["default_speeds"] = DEFAULT_SPEEDS

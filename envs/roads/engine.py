@@ -26,7 +26,7 @@ from cavbench.envs.roads.generator import WORDS, Generator, seed_generator
 from cavbench.envs.roads.grids import occupancy, times_to_collision
 from cavbench.envs.roads.lanes import is_on
 from cavbench.envs.roads.motion import apply_meta_action
-from cavbench.envs.roads.network import WIDTH
+from cavbench.envs.roads.network import ROAD, WIDTH
 from cavbench.envs.roads.progress import progress, way_left
 from cavbench.envs.roads.recordings import Recordings, joined
 from cavbench.envs.roads.rows import observe
@@ -265,9 +265,12 @@ def step_batch(
     flags: NDArray[np.bool_],
     parts: Floats,
     recordings: Recordings,
-) -> None:
-    """One action of every unfinished episode. See `RoadsEngine.step`."""
+) -> bool:
+    """One action of every unfinished episode, or False and nothing if there is no such action. See `RoadsEngine.step`."""
     corners, given = np.empty((2, 5, 2)), parameters[0]
+    for number in range(episodes.size):
+        if not 0 <= actions[number] < given.choices:
+            return False
     rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
     grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
     for number in range(episodes.size):
@@ -283,6 +286,7 @@ def step_batch(
         report(road, cars, episode, given, numbers, flags, number)
         if given.task == INTERSECTION:
             intersection.after_step(road, cars, episode, generators[number])
+    return True
 
 
 @entry_point
@@ -298,8 +302,11 @@ def start_batch(
     numbers: NDArray[np.float32],
     flags: NDArray[np.bool_],
     recordings: Recordings,
-) -> None:
-    """Start the episodes `chosen` [R] from `seeds` [R]. See `RoadsEngine.reset`."""
+) -> bool:
+    """Start the episodes `chosen` [R] from `seeds` [R], or nothing and False if one is negative. See `RoadsEngine.reset`."""
+    for row in range(seeds.size):
+        if seeds[row] < 0:
+            return False
     rows, work = np.empty(observation.shape[1] - 1, np.int64), np.empty(observation.shape[1] + 3)
     corners, given = np.empty((2, 5, 2)), parameters[0]
     grid = np.zeros((given.speeds, MOST_SIDE_LANES, max(given.horizon, 1)))
@@ -314,6 +321,7 @@ def start_batch(
         spawn(road, cars, episode, generators[number], given, corners, recordings)
         look(road, cars, episode, given, rows, work, grid, observation[number])
         report(road, cars, episode, given, numbers, flags, number)
+    return True
 
 
 @entry_point
@@ -353,7 +361,8 @@ class RoadsEngine:
         self.config = config
         different: dict[int, Scene] = {id(scene.road): scene for scene in config.scenes}
         scenes, places = list(different.values()), {key: place for place, key in enumerate(different)}
-        self.roads = np.concatenate([scene.road for scene in scenes])
+        # The very dtype: numba finds the type of an array fast by that object, and compares all its fields by any other.
+        self.roads = np.concatenate([scene.road for scene in scenes]).view(ROAD)
         self.parameters = parameters(config)
         self.bodies = np.zeros((batch, max(scene.capacity for scene in config.scenes)), dtype=BODY)
         self.episodes = np.zeros(batch, dtype=EPISODE)
@@ -382,8 +391,7 @@ class RoadsEngine:
         Raises:
             ValueError: if a seed is negative.
         """
-        check_seeds(seeds)
-        start_batch(
+        started = start_batch(
             self.roads,
             self.bodies,
             self.episodes,
@@ -396,6 +404,8 @@ class RoadsEngine:
             self.flags,
             self.recordings,
         )
+        if not started:
+            check_seeds(seeds)
 
     def look(self) -> None:
         """Write the current observation and record of every episode, without a step."""
@@ -422,12 +432,9 @@ class RoadsEngine:
         if self.config.ego == Kind.DISCRETE:
             # Always one memory layout: numba would compile again for another one.
             actions = np.ascontiguousarray(action, dtype=np.int64)
-            last = len(self.config.actions) - 1
-            if actions.min() < 0 or actions.max() > last:
-                raise ValueError(f"actions must be between 0 and {last}, got {actions.tolist()}")
         elif self.config.ego == Kind.CONTINUOUS:
             controls = self.controls(np.asarray(action))
-        step_batch(
+        stepped = step_batch(
             self.roads,
             self.bodies,
             self.episodes,
@@ -442,3 +449,5 @@ class RoadsEngine:
             self.parts,
             self.recordings,
         )
+        if not stepped:
+            raise ValueError(f"actions must be between 0 and {len(self.config.actions) - 1}, got {actions.tolist()}")

@@ -94,7 +94,7 @@ def joined(parts: list[Recordings]) -> tuple[Recordings, NDArray[np.int64]]:
         )
     whole = Recordings(
         np.concatenate([part.frames for part in parts]),
-        np.concatenate(tracks),
-        np.concatenate([part.starts for part in parts]),
+        np.concatenate(tracks).view(TRACK),
+        np.concatenate([part.starts for part in parts]).view(START),
     )
     return whole, np.array(bounds, dtype=np.int64)

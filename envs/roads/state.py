@@ -81,6 +81,9 @@ class Body:
     target_lane: int
     target_speed: float  # m/s
     steering: float  # rad
+    slip_steering: float  # rad, a steering angle whose slip angle is stored
+    slip: float  # rad, the direction of the motion minus the heading
+    sin_slip: float
     acceleration: float  # m/s2
     timer: float  # s since a lane change was last considered
     delta: float  # exponent of the IDM
@@ -205,6 +208,7 @@ class Parameters(Protocol):
     full_steps: int  # `max_steps` of the world, also in a planner's copies
     action_repeat: int
     actions: Integers  # the five discrete actions, by the task's numbers
+    choices: int  # how many numbers the task has
     layout: int  # `ViewKind`
     horizon: int  # steps of a grid of times to collision
     speeds: int  # number of target speeds
