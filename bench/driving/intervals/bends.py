@@ -1,0 +1,547 @@
+"""A road that bends, straightened: boxes in x and y are enclosed by boxes along and across the way of the ego.
+
+A straightened box has the station along the left lane, the offset to its right, and the speeds along and across the way. As
+elsewhere, the rows of other cars are relative to the ego. The ego's own row holds its reckoned station as an interval.
+
+The enclosure is sound for every car whose centre is on the road or at most `ASIDE` m beside it. One that is nowhere on the road
+counts on all lanes, standing, at its straight distance: no way along the road is shorter.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from cavbench.driving.features import ActionType
+from cavbench.driving.intervals import motion_kernels, way_kernels
+from cavbench.driving.intervals.boxes import Assumed, Boxes, flat, shaped
+from cavbench.driving.intervals.ego import DeadReckoning, Ego, Step, stacked
+from cavbench.driving.intervals.way_kernels import DOUBT, PURSUIT_S, STATION
+from cavbench.driving.kinematics import Kinematics
+from cavbench.driving.way import Way
+
+ASIDE = 1.0
+"""A car on the road has its centre at most this far beside the outermost lanes, in m."""
+FAR = 1e3
+"""Beyond every road, in m."""
+ROUNDING = 0.01
+"""Enclosures are wider by this on every side, in m and m/s: float32, and what a reckoned ego may be wrong by."""
+BEHIND = 30.0
+"""On a closed way a car counts as ahead, unless it is at most so far behind, in m."""
+ONWARD = 50.0
+"""Bends as far ahead of a car, in m, count for what it will drive."""
+STEP = 0.6
+"""The ego's station is cut into pieces of at most this length, in m, each to both sides of its middle."""
+
+
+class Table(NamedTuple):
+    """The stretches, [P] each."""
+
+    x: Tensor
+    y: Tensor
+    heading: Tensor
+    curvature: Tensor
+    station: Tensor
+    begin: Tensor
+    end: Tensor
+    length: Tensor
+
+
+@cache
+def _table(way: Way) -> Table:
+    """The stretches; `begin` and `end` are where each ends along itself, in m: an open way goes on beyond both of its ends."""
+    rows = [(one.x, one.y, one.heading, one.curvature, at) for one, at in zip(way.stretches, way.stations, strict=True)]
+    lengths = [one.length for one in way.stretches]
+    begin, end = [0.0] * len(lengths), list(lengths)
+    if not way.closed:
+        begin[0], end[-1] = -FAR, FAR
+    return Table(*torch.tensor(rows).unbind(-1), *map(torch.tensor, (begin, end, lengths)))
+
+
+@cache
+def _route(way: Way, lane_width: float) -> way_kernels.Route:
+    rows = [
+        (one.x, one.y, one.heading, one.length, one.curvature, at)
+        for one, at in zip(way.stretches, way.stations, strict=True)
+    ]
+    lane = -1 if way.start_lane is None else way.start_lane
+    return way_kernels.Route(
+        np.array(rows), way.closed, way.lanes, way.length, np.array(way.start, float), lane, lane_width
+    )
+
+
+def _within(values: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest of the values [..., P] that are valid; without one, the other way round."""
+    big = torch.full_like(values, torch.inf)
+    return torch.where(valid, values, big).amin(-1), torch.where(valid, values, -big).amax(-1)
+
+
+class Enclosure(NamedTuple):
+    """Bounds along every stretch [..., P], and whether the box reaches it.
+
+    Args:
+        valid: bool [..., P].
+        along: from the beginning of the stretch, in m.
+        offset: to the right of the left lane, in m.
+    """
+
+    valid: Tensor
+    along: tuple[Tensor, Tensor]
+    offset: tuple[Tensor, Tensor]
+
+
+def enclosed(way: Way, lane_width: float, low: Tensor, high: Tensor) -> Enclosure:
+    """Where on the road a point may be that is in a rectangle.
+
+    Along a straight stretch both coordinates are linear, so the corners have the extremes. Around the centre of an arc the
+    largest distance is that of a corner, the least one that of the rectangle, and without the centre in it the corners have the
+    extreme angles.
+
+    Args:
+        way: the way.
+        lane_width: in m.
+        low, high: x and y of the rectangle, in m, [..., 2].
+    """
+    table = Table(*(column.to(low) for column in _table(way)))
+    x = torch.stack([low[..., 0], low[..., 0], high[..., 0], high[..., 0]], -1).unsqueeze(-2)
+    y = torch.stack([low[..., 1], high[..., 1], low[..., 1], high[..., 1]], -1).unsqueeze(-2)
+    cos, sin = table.heading.cos().unsqueeze(-1), table.heading.sin().unsqueeze(-1)
+    dx, dy = x - table.x.unsqueeze(-1), y - table.y.unsqueeze(-1)
+    along, across = dx * cos + dy * sin, dy * cos - dx * sin
+    bent = table.curvature != 0
+    turn, radius = table.curvature.sign(), 1 / torch.where(bent, table.curvature.abs(), 1.0)
+    centre = table.x - turn * radius * table.heading.sin(), table.y + turn * radius * table.heading.cos()
+    out_x, out_y = x - centre[0].unsqueeze(-1), y - centre[1].unsqueeze(-1)
+    middle = table.heading + table.curvature * table.length / 2 - turn * math.pi / 2
+    # atan2 has no slope in the centre itself.
+    out_y = torch.where((out_x == 0) & (out_y == 0), 1e-6, out_y)
+    turned = torch.remainder(torch.atan2(out_y, out_x) - middle.unsqueeze(-1) + math.pi, 2 * math.pi) - math.pi
+    turned = turned * turn.unsqueeze(-1)
+    least, most = turned.amin(-1), turned.amax(-1)
+    # The rectangle lies across the ray opposite to the arc, or around the centre.
+    all_round = most - least > math.pi
+    least, most = torch.where(all_round, -math.pi, least), torch.where(all_round, math.pi, most)
+    near_x = torch.maximum(low[..., :1] - centre[0], centre[0] - high[..., :1]).clamp(min=0)
+    near_y = torch.maximum(low[..., 1:] - centre[1], centre[1] - high[..., 1:]).clamp(min=0)
+    near, far = (near_x**2 + near_y**2 + 1e-12).sqrt(), (out_x**2 + out_y**2 + 1e-12).sqrt().amax(-1)
+    sides = turn * (radius - near), turn * (radius - far)
+    along_low = torch.where(bent, least * radius + table.length / 2, along.amin(-1))
+    along_high = torch.where(bent, most * radius + table.length / 2, along.amax(-1))
+    offset_low = torch.where(bent, torch.minimum(*sides), across.amin(-1))
+    offset_high = torch.where(bent, torch.maximum(*sides), across.amax(-1))
+    slack = ROUNDING + way.misfit
+    band = -lane_width / 2 - ASIDE - slack, (way.lanes - 0.5) * lane_width + ASIDE + slack
+    begin, end = table.begin - slack, table.end + slack
+    valid = (along_low <= end) & (along_high >= begin) & (offset_low <= band[1]) & (offset_high >= band[0])
+    return Enclosure(
+        valid,
+        (torch.maximum(along_low, begin), torch.minimum(along_high, end)),
+        (offset_low.clamp(min=band[0]), offset_high.clamp(max=band[1])),
+    )
+
+
+def projected(low: Tensor, high: Tensor, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Bounds of a velocity along and across directions from `first` to `last`, in rad, [..., P]; of along, then of across.
+
+    Args:
+        low, high: bounds of the velocity's x and y, [..., 2].
+        first, last: the directions, [..., P].
+    """
+    x = torch.stack([low[..., 0], low[..., 0], high[..., 0], high[..., 0]], -1)
+    y = torch.stack([low[..., 1], high[..., 1], low[..., 1], high[..., 1]], -1)
+    still = x**2 + y**2 < 1e-10
+    x = torch.where(still, 1e-5, x)
+    size, angle = (x**2 + y**2).sqrt().unsqueeze(-2), torch.atan2(y, x).unsqueeze(-2)
+    first, last = first.unsqueeze(-1), last.unsqueeze(-1)
+    along = _cosines(first - angle, last - angle)
+    across = _cosines(first - angle + math.pi / 2, last - angle + math.pi / 2)
+    return (
+        (size * along[0]).amin(-1),
+        (size * along[1]).amax(-1),
+        (size * across[0]).amin(-1),
+        (size * across[1]).amax(-1),
+    )
+
+
+def _cosines(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest cosine of the angles from `first` to `last`."""
+    whole = 2 * math.pi
+    ends = torch.stack([first.cos(), last.cos()], -1)
+    top = (last / whole).floor() >= (first / whole).ceil()
+    bottom = ((last - math.pi) / whole).floor() >= ((first - math.pi) / whole).ceil()
+    return torch.where(bottom, -1.0, ends.amin(-1)), torch.where(top, 1.0, ends.amax(-1))
+
+
+def directions(way: Way, station: Tensor) -> tuple[Tensor, Tensor]:
+    """The direction of the way at stations [...], in rad, and its curvature there."""
+    table = Table(*(column.to(station) for column in _table(way)))
+    if way.closed:
+        station = station.remainder(way.length)
+    inside = station.unsqueeze(-1) >= table.station
+    number = (inside.sum(-1) - 1).clamp(min=0)
+    along = station - table.station[number]
+    return table.heading[number] + table.curvature[number] * along, table.curvature[number]
+
+
+def points(way: Way, station: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
+    """The points x, y of places [...]."""
+    table = Table(*(column.to(station) for column in _table(way)))
+    heading, curvature = directions(way, station)
+    if way.closed:
+        station = station.remainder(way.length)
+    number = ((station.unsqueeze(-1) >= table.station).sum(-1) - 1).clamp(min=0)
+    along, begins = station - table.station[number], table.heading[number]
+    bent = curvature != 0
+    safe = torch.where(bent, curvature, 1.0)
+    x = torch.where(bent, (heading.sin() - begins.sin()) / safe, along * begins.cos())
+    y = torch.where(bent, (begins.cos() - heading.cos()) / safe, along * begins.sin())
+    return table.x[number] + x - offset * heading.sin(), table.y[number] + y + offset * heading.cos()
+
+
+def turned(way: Way, station: Tensor) -> Tensor:
+    """By how much the way has turned from station 0 to stations [...], in rad, over several rounds if it is closed."""
+    table = Table(*(column.to(station) for column in _table(way)))
+    rounds = torch.zeros_like(station)
+    if way.closed:
+        rounds = (station / way.length).floor()
+        station = station - rounds * way.length
+    part = (station.unsqueeze(-1) - table.station).clamp(min=0).minimum(table.length)
+    return (part * table.curvature).sum(-1) + rounds * (table.length * table.curvature).sum()
+
+
+def _curved(way: Way, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
+    """The least and the largest curvature between two stations [...]."""
+    table = Table(*(column.to(first) for column in _table(way)))
+    first, last = first.unsqueeze(-1), last.unsqueeze(-1)
+    begin, end = table.station + table.begin, table.station + table.end
+    touched = (last >= begin) & (first <= end)
+    if way.closed:
+        for laps in (-1, 1):
+            touched = touched | ((last >= begin + laps * way.length) & (first <= end + laps * way.length))
+    return _within(table.curvature.expand_as(touched), touched)
+
+
+def slip(curvature: Tensor, car: Kinematics) -> Tensor:
+    """By how much a car that follows a curve points to the outside of where it moves, in rad: the bicycle model."""
+    return (curvature * (car.length / 2)).clamp(-1, 1).asin()
+
+
+class BentReckoning(DeadReckoning):
+    """Dead reckoning on a way. Its states have the station and its doubt besides, [..., 9].
+
+    The heading of its egos is the direction in which they move, from that of the way: in a bend a car points elsewhere.
+    """
+
+    def __init__(
+        self, kinematics: Kinematics, period: float, actions: tuple[str, ...], action_type: ActionType
+    ) -> None:
+        super().__init__(kinematics, period, actions, action_type)
+        assert kinematics.way is not None
+        self.way = kinematics.way
+        self.route = _route(self.way, kinematics.lane_width)
+
+    def unknown(self, episodes: Tensor) -> Tensor:
+        return torch.zeros(len(episodes), DOUBT + 1, device=episodes.device)
+
+    def boxes(self, assumed: Assumed, shown: Tensor, state: Tensor, tracks: Tensor | None = None) -> Boxes:
+        measured = assumed.boxes(shown)
+        states = self._corrected(measured, state)
+        found = _straightened(self.kinematics, measured, states)
+        return found if tracks is None else _narrowed(found, tracks, measured.high[..., 0].isfinite())
+
+    def _corrected(self, measured: Boxes, state: Tensor) -> Tensor:
+        """The states [..., 9] at an observation, from those that were predicted."""
+        leading = measured.present.shape[:-1]
+        states = flat(state.expand(*leading, state.shape[-1]), 1)
+        own = measured.low[..., 0, :], measured.high[..., 0, :]
+        now = np.empty_like(states)
+        way_kernels.corrected(states, flat(own[0], 1), flat(own[1], 1), self.car, self.route, now)
+        return shaped(now, leading, state)
+
+    def now(self, boxes: Boxes, state: Tensor) -> Ego:
+        return _ego(boxes, state, self)
+
+    def step(self, boxes: Boxes, state: Tensor, action: Tensor) -> Step:
+        ego = self.now(boxes, state)
+        row = boxes.low[..., 0, 0], boxes.high[..., 0, 0]
+        place = torch.stack([torch.ones_like(ego.y), (row[0] + row[1]) / 2, (row[1] - row[0]) / 2], -1)
+        states = torch.cat([torch.stack(tuple(ego), -1), place], -1).detach()
+        orders, turns = self._changes[:, action.cpu()].numpy()
+        moved = flat(states, 1).copy()
+        way_kernels.driven(moved, orders, turns, self.car, self.route)
+        return Step(ego, shaped(moved, states.shape[:-1], states))
+
+    def after(self, ego: Ego, action: Tensor) -> Tensor:
+        raise NotImplementedError("on a way, `step` knows the station")
+
+    def corrected(self, observation: Tensor, ego: Ego, boxes: Boxes, assumed: Assumed) -> Tensor:
+        station = (boxes.low[..., 0, 0] + boxes.high[..., 0, 0]) / 2
+        direction, curvature = directions(self.way, station)
+        heading = direction + ego.heading - slip(curvature, self.kinematics)
+        place = points(self.way, station, ego.y)
+        own = torch.stack([*place, ego.speed * heading.cos(), ego.speed * heading.sin()], -1)
+        row = torch.cat((observation[..., 0, :1], assumed.normalised(own)), -1)
+        return torch.cat((row.unsqueeze(-2), observation[..., 1:, :]), -2)
+
+
+def _ego(boxes: Boxes, state: Tensor, of: BentReckoning) -> Ego:
+    """The ego at an observation, from its row; what it aims for, from its state."""
+    low = boxes.low[..., 0, :]
+    known = state[..., motion_kernels.KNOWN] > 0
+    lane = torch.where(known, state[..., motion_kernels.LANE], (low[..., 1] / of.kinematics.lane_width).round())
+    start = of.kinematics.start_speed
+    return Ego(
+        y=low[..., 1],
+        heading=state[..., motion_kernels.HEADING].expand_as(lane),
+        speed=(low[..., 2] ** 2 + low[..., 3] ** 2 + 1e-12).sqrt(),
+        target_lane=lane,
+        target_speed=torch.where(known, state[..., motion_kernels.TARGET], 0.0 if start is None else start),
+        edge=torch.full_like(lane, of.way.lanes - 1),
+    )
+
+
+def _straightened(car: Kinematics, measured: Boxes, states: Tensor) -> Boxes:
+    """The boxes of a measurement, straightened."""
+    station, doubt = states[..., STATION], states[..., DOUBT]
+    course, speed = states[..., motion_kernels.HEADING], states[..., motion_kernels.SPEED]
+    pieces = (doubt / STEP).ceil().clamp(min=1)
+    low, high = _seen(car, measured, states, station - doubt + doubt / pieces, doubt / pieces)
+    for piece in range(1, int(pieces.max())):
+        # The pieces of an episode do not depend on the others of the batch.
+        counts = (piece < pieces)[..., None, None]
+        least, most = _seen(car, measured, states, station + doubt * ((2 * piece + 1) / pieces - 1), doubt / pieces)
+        low = torch.where(counts, torch.minimum(low, least), low)
+        high = torch.where(counts, torch.maximum(high, most), high)
+    own = torch.stack([station, states[..., motion_kernels.Y], speed * course.cos(), speed * course.sin()], -1)
+    unsure, still = torch.stack([doubt, *[torch.zeros_like(doubt)] * 3], -1), torch.cat([0 * own[..., :1], own[..., 1:]], -1)
+    return Boxes(
+        measured.present,
+        torch.cat([(own - unsure).unsqueeze(-2), low - still.unsqueeze(-2)], -2),
+        torch.cat([(own + unsure).unsqueeze(-2), high - still.unsqueeze(-2)], -2),
+    )
+
+
+def _seen(
+    car: Kinematics, measured: Boxes, states: Tensor, station: Tensor, half: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Bounds of the other cars, [..., V - 1, 4]: the station from that of the ego, the offset, the speeds along and across.
+
+    Args:
+        car: the kinematics, with a way.
+        measured: x, y, vx and vy in the frame of the world; those of others from the ego's.
+        states: the ego, [..., 9].
+        station: the middle of where it is, [...].
+        half: by how much it may be elsewhere, in m, [...].
+    """
+    way = car.way
+    assert way is not None
+    speed, course = states[..., motion_kernels.SPEED], states[..., motion_kernels.HEADING]
+    direction, curvature = directions(way, station)
+    heading = direction + course - slip(curvature, car)
+    place = torch.stack(points(way, station, states[..., motion_kernels.Y]), -1)
+    velocity = speed.unsqueeze(-1) * torch.stack([heading.cos(), heading.sin()], -1)
+    along = torch.stack([direction.cos().abs(), direction.sin().abs()], -1)
+    moved = half.unsqueeze(-1) * (along + (half * curvature.abs()).unsqueeze(-1)) + ROUNDING
+    turns = (speed * half * curvature.abs()).unsqueeze(-1) + ROUNDING
+    low, high = measured.low[..., 1:, :].clamp(min=-FAR), measured.high[..., 1:, :].clamp(max=FAR)
+    least, most = low[..., :2] + (place - moved).unsqueeze(-2), high[..., :2] + (place + moved).unsqueeze(-2)
+    slowest, fastest = low[..., 2:] + (velocity - turns).unsqueeze(-2), high[..., 2:] + (velocity + turns).unsqueeze(-2)
+    slowest, fastest = slowest.clamp(min=-car.top_speed), fastest.clamp(max=car.top_speed)
+    found = enclosed(way, car.lane_width, least, most)
+    table = Table(*(column.to(low) for column in _table(way)))
+    first, last = (table.heading + table.curvature * bound for bound in found.along)
+    first, last = torch.minimum(first, last) - way.kink, torch.maximum(first, last) + way.kink
+    speeds = projected(slowest, fastest, first, last)
+    from_ego = [table.station + bound - station[..., None, None] for bound in found.along]
+    if way.closed:
+        rounds = ((sum(from_ego) / 2 + BEHIND) / way.length).floor() * way.length
+        from_ego = [bound - rounds for bound in from_ego]
+    slack = half[..., None, None]
+    bounds = [
+        _within(from_ego[0] - slack, found.valid)[0],
+        _within(found.offset[0], found.valid)[0],
+        _within(speeds[0], found.valid)[0],
+        _within(speeds[2], found.valid)[0],
+        _within(from_ego[1] + slack, found.valid)[1],
+        _within(found.offset[1], found.valid)[1],
+        _within(speeds[1], found.valid)[1],
+        _within(speeds[3], found.valid)[1],
+    ]
+    # Nowhere on the road: on all lanes, standing, no farther along the road than it is.
+    apart = torch.maximum((least - place.unsqueeze(-2)), (place.unsqueeze(-2) - most)).clamp(min=0)
+    nearest = (apart**2).sum(-1).add(1e-12).sqrt()
+    beside = ASIDE + car.lane_width / 2
+    right = (way.lanes - 1) * car.lane_width + beside
+    lost = nearest, -beside, 0.0, 0.0, FAR, right, 0.0, 0.0
+    on_road = found.valid.any(-1)
+    rows = [
+        torch.where(on_road, bound, torch.as_tensor(other).to(bound)) for bound, other in zip(bounds, lost, strict=True)
+    ]
+    return torch.stack(rows[:4], -1), torch.stack(rows[4:], -1)
+
+
+def _narrowed(found: Boxes, tracks: Tensor, inside: Tensor) -> Boxes:
+    """The boxes of other cars, each intersected with the hull of all tracks that it may belong to (`box_kernels.narrow`).
+
+    Args:
+        found: straightened boxes [..., V, 4].
+        tracks: of `predicted`, [..., K, 9].
+        inside: bool [..., V], whether a car is within the range of the sensor; new ones appear at its end.
+    """
+    low, high = found.low[..., 1:, :], found.high[..., 1:, :]
+    least, most = tracks[..., 1:5], tracks[..., 5:]
+    meets = (low.unsqueeze(-2) <= most.unsqueeze(-3)) & (least.unsqueeze(-3) <= high.unsqueeze(-2))
+    fits = meets.all(-1) & (tracks[..., 0] > 0).unsqueeze(-2) & (found.present & inside)[..., 1:].unsqueeze(-1)
+    inf = torch.full_like(least, torch.inf).unsqueeze(-3)
+    least = torch.where(fits.unsqueeze(-1), least.unsqueeze(-3), inf).amin(-2)
+    most = torch.where(fits.unsqueeze(-1), most.unsqueeze(-3), -inf).amax(-2)
+    lower, upper = torch.maximum(low, least), torch.minimum(high, most)
+    common = fits.any(-1, keepdim=True) & (lower <= upper)
+    low, high = torch.where(common, lower, low), torch.where(common, upper, high)
+    return Boxes(
+        found.present,
+        torch.cat([found.low[..., :1, :], low], -2),
+        torch.cat([found.high[..., :1, :], high], -2),
+    )
+
+
+def cut(car: Kinematics) -> float:
+    """By how much highway-env's controllers let a car cut the sharpest bend at its highest target speed, in m.
+
+    A car at speed v in a bend of curvature c turns at the rate v c, which the heading's gain answers 1 / gain s late, and the
+    lane's direction is known `PURSUIT_S` ahead. The rest must come from the distance to the lane, times its gain.
+    """
+    assert car.way is not None
+    late = max(1 / car.heading_gain - PURSUIT_S, 0.0)
+    return car.target_speeds[-1] ** 2 * car.way.sharpest * late / car.lateral_gain
+
+
+def lengthened(car: Kinematics) -> float:
+    """By how much more than its length a car takes up of the innermost path of the sharpest bend, in m.
+
+    Two cars on a circle touch with the corners of their inner sides first.
+    """
+    assert car.way is not None
+    outermost = (car.way.lanes - 1) * car.lane_width
+    longest = max((abs(one.curvature) / (1 - max(one.curvature * outermost, 0.0)) for one in car.way.stretches))
+    if longest == 0:
+        return 0.0
+    radius = 1 / longest - cut(car)
+    return 2 * radius * math.atan(car.length / 2 / (radius - car.width / 2)) - car.length
+
+
+def paths(ego: Ego, boxes: Boxes, car: Kinematics) -> tuple[Tensor, Tensor]:
+    """Bounds of the other cars as a straight road has them, [..., V - 1, 4]: x, y, vx and vy, of which x is from the ego.
+
+    In a bend the way along one lane is longer than along another. So x and vx are bounds over all paths between the ego's and
+    the car's, and `cut` beyond those of the car: on the path at offset d, stations s and s' are s' - s - d (h' - h) apart, where
+    h is the direction of the way.
+    """
+    way = car.way
+    assert way is not None
+    own = torch.stack([torch.zeros_like(ego.y), ego.y, *_speeds(ego)], -1).unsqueeze(-2)
+    low, high = boxes.low[..., 1:, :] + own, boxes.high[..., 1:, :] + own
+    row = boxes.low[..., :1, 0], boxes.high[..., :1, 0]
+    middle, doubt = (row[0] + row[1]) / 2, (row[1] - row[0]) / 2
+    cuts, offset = cut(car), ego.y.unsqueeze(-1)
+    left, right = torch.minimum(low[..., 1] - cuts, offset), torch.maximum(high[..., 1] + cuts, offset)
+    near, far = row[0] + low[..., 0], row[1] + high[..., 0]
+    least, most = _curved(way, near, far + ONWARD)
+    between = _curved(way, torch.minimum(row[0], near), torch.maximum(row[1], far))
+    bends = torch.maximum(between[1], most).clamp(min=0) - torch.minimum(between[0], least).clamp(max=0)
+    slack = torch.maximum(left.abs(), right.abs()) * (between[1].clamp(min=0) - between[0].clamp(max=0)) * doubt / 2
+    x_low, x_high = torch.full_like(near, torch.inf), torch.full_like(near, -torch.inf)
+    for begin in (row[0], middle, row[1]):
+        for path in (left, right):
+            x_low = torch.minimum(x_low, _apart(way, begin, low[..., 0], path))
+            x_high = torch.maximum(x_high, _apart(way, begin, high[..., 0], path))
+    longer = slack + lengthened(car) * (bends > 0)
+    x_low = x_low - longer
+    x_high = x_high + longer
+    # As fast as the car goes on its own path, it goes by less along a longer one.
+    to_left, to_right = left - high[..., 1], right - low[..., 1]
+    shares = [
+        1 - curvature * beside / (1 - curvature * at)
+        for curvature in (least, most, torch.zeros_like(least))
+        for beside in (to_left, to_right)
+        for at in (low[..., 1], high[..., 1])
+    ]
+    share = torch.stack(shares, -1)
+    slower, faster = share.amin(-1).clamp(min=0), share.amax(-1)
+    vx_low = torch.where(low[..., 2] >= 0, low[..., 2] * slower, low[..., 2] * faster)
+    vx_high = torch.where(high[..., 2] >= 0, high[..., 2] * faster, high[..., 2] * slower)
+    # A car in a bend points to the outside of where it moves.
+    here = _curved(way, near, far)
+    slips = torch.stack([speed * slip(one, car).sin() for speed in (low[..., 2], high[..., 2]) for one in here], -1)
+    vy_low, vy_high = low[..., 3] + slips.amin(-1), high[..., 3] + slips.amax(-1)
+    return (
+        torch.stack([x_low, low[..., 1], vx_low, vy_low], -1),
+        torch.stack([x_high, high[..., 1], vx_high, vy_high], -1),
+    )
+
+
+def _apart(way: Way, station: Tensor, further: Tensor, offset: Tensor) -> Tensor:
+    """The length of the path at an offset from a station to one that is `further`, in m."""
+    return further - offset * (turned(way, station + further) - turned(way, station))
+
+
+def _speeds(ego: Ego) -> tuple[Tensor, Tensor]:
+    return ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
+
+
+def predicted(
+    boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, limits: motion_kernels.Limits
+) -> Tensor:
+    """`tracks.predicted` on a way: the other cars one decision later, [B, V - 1, 9], without a gradient.
+
+    The compiled loop moves them as on a straight road. What the bend changes comes on top: the direction of the way turns under
+    a car by its speed times the curvature, and a metre of its path is 1 / (1 - c d) m of the left lane, at the offset d.
+    """
+    way = car.way
+    assert way is not None
+    period = float(limits.period)
+    row = boxes.low[:, 0].detach(), boxes.high[:, 0].detach()
+    station, own = (row[0][:, 0] + row[1][:, 0]) / 2, row[0][:, None, 1:]
+    low, high = boxes.low[:, 1:].detach(), boxes.high[:, 1:].detach()
+    absolute = low[..., 1:] + own, high[..., 1:] + own
+    largest = torch.maximum(absolute[0].abs(), absolute[1].abs())
+    fastest = torch.hypot(largest[..., 1], largest[..., 2]) + float(limits.gained)
+    reach = car.top_speed * period + ROUNDING + way.misfit
+    first, last = row[0][:, :1] + low[..., 0] - reach, row[1][:, :1] + high[..., 0] + reach
+    curvatures = _curved(way, first, last)
+    sides = absolute[0][..., 0] - ASIDE, absolute[1][..., 0] + ASIDE
+    shares = torch.stack([1 / (1 - one * side).clamp(min=0.1) for one in curvatures for side in sides], -1)
+    least, most = shares.amin(-1), shares.amax(-1)
+    crossed = _crossed(way, first, last) | _crossed(way, station - reach, station + reach).unsqueeze(-1)
+    turn = torch.maximum(curvatures[0].abs(), curvatures[1].abs()) * most * fastest * period + way.kink * crossed
+    swing = (turn * fastest).unsqueeze(-1) * torch.tensor([0.0, 0.0, 0.0, 1.0])
+    given = flat(torch.cat([row[0].unsqueeze(1), low - swing], 1), 2), flat(torch.cat([row[1].unsqueeze(1), high + swing], 1), 2)
+    tracks = np.empty((len(low), low.shape[1], 9), np.float32)
+    motion_kernels.later(flat(boxes.present, 1), *given, stacked(before).numpy(), flat(after, 1), limits, tracks)
+    found = torch.from_numpy(tracks)
+    # What the loop added to the stations is undone, and added as far as the left lane gets longer by it.
+    driven = (before.speed + after[:, motion_kernels.SPEED]) / 2 * before.heading.cos() * period
+    moved = after[:, STATION] - station
+    if way.closed:
+        moved = moved - (moved / way.length).round() * way.length
+    slack = float(limits.rounding) + way.misfit * crossed
+    behind = found[..., 1] + driven.unsqueeze(-1) - low[..., 0] + float(limits.rounding)
+    ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - float(limits.rounding)
+    found[..., 1] = low[..., 0] + behind * torch.where(behind >= 0, least, most) - moved.unsqueeze(-1) - slack
+    found[..., 5] = high[..., 0] + ahead * torch.where(ahead >= 0, most, least) - moved.unsqueeze(-1) + slack
+    found[..., 2] -= way.misfit * crossed
+    found[..., 6] += way.misfit * crossed
+    return found
+
+
+def _crossed(way: Way, first: Tensor, last: Tensor) -> Tensor:
+    """Whether there is a misfit between two stations, bool [...]."""
+    if way.misfit == 0 and way.kink == 0:
+        return torch.zeros_like(first, dtype=torch.bool)
+    joints = torch.tensor([at + lap * way.length for lap in ((-1, 0, 1) if way.closed else (0,)) for at in way.stations])
+    return ((first.unsqueeze(-1) <= joints) & (last.unsqueeze(-1) >= joints)).any(-1)
