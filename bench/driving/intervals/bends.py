@@ -252,7 +252,7 @@ class BentReckoning(DeadReckoning):
         measured = assumed.boxes(shown)
         states = self._corrected(measured, state)
         found = _straightened(self.kinematics, measured, states)
-        return found if tracks is None else _narrowed(found, tracks, measured.high[..., 0].isfinite())
+        return found if tracks is None else _narrowed(found, tracks, _known(measured))
 
     def _corrected(self, measured: Boxes, state: Tensor) -> Tensor:
         """The states [..., 9] at an observation, from those that were predicted."""
@@ -385,18 +385,31 @@ def _seen(
     return torch.stack(rows[:4], -1), torch.stack(rows[4:], -1)
 
 
-def _narrowed(found: Boxes, tracks: Tensor, inside: Tensor) -> Boxes:
+def _known(measured: Boxes) -> Tensor:
+    """Which of the other cars cannot be new, bool [..., V - 1].
+
+    The rows are the nearest cars in the range of the sensor. So a new one is the farthest of all, or the last one of full rows.
+    """
+    nearest = torch.maximum(measured.low[..., 1:, :2], -measured.high[..., 1:, :2]).clamp(min=0).norm(dim=-1)
+    furthest = torch.maximum(measured.high[..., 1:, :2], -measured.low[..., 1:, :2]).norm(dim=-1)
+    others = torch.where(measured.present[..., 1:], nearest, 0.0)
+    known = furthest < others.amax(-1, keepdim=True)
+    known[..., -1] = False
+    return known
+
+
+def _narrowed(found: Boxes, tracks: Tensor, known: Tensor) -> Boxes:
     """The boxes of other cars, each intersected with the hull of all tracks that it may belong to (`box_kernels.narrow`).
 
     Args:
         found: straightened boxes [..., V, 4].
         tracks: of `predicted`, [..., K, 9].
-        inside: bool [..., V], whether a car is within the range of the sensor; new ones appear at its end.
+        known: bool [..., V - 1], the cars that cannot be new.
     """
     low, high = found.low[..., 1:, :], found.high[..., 1:, :]
     least, most = tracks[..., 1:5], tracks[..., 5:]
     meets = (low.unsqueeze(-2) <= most.unsqueeze(-3)) & (least.unsqueeze(-3) <= high.unsqueeze(-2))
-    fits = meets.all(-1) & (tracks[..., 0] > 0).unsqueeze(-2) & (found.present & inside)[..., 1:].unsqueeze(-1)
+    fits = meets.all(-1) & (tracks[..., 0] > 0).unsqueeze(-2) & (found.present[..., 1:] & known).unsqueeze(-1)
     inf = torch.full_like(least, torch.inf).unsqueeze(-3)
     least = torch.where(fits.unsqueeze(-1), least.unsqueeze(-3), inf).amin(-2)
     most = torch.where(fits.unsqueeze(-1), most.unsqueeze(-3), -inf).amax(-2)
