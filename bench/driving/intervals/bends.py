@@ -35,6 +35,12 @@ BEHIND = 30.0
 """On a closed way a car counts as ahead, unless it is at most so far behind, in m."""
 ONWARD = 50.0
 """Bends as far ahead of a car, in m, count for what it will drive."""
+REMEMBERED = 6
+"""Number of cars out of sight that the tracker remembers."""
+IN_SIGHT = -8.0
+"""A car that is less behind than this along the ego's lane is surely seen, in m (BEHIND of highway-env's observation is -10)."""
+EASED = 1.0
+"""A car out of sight slows down by at most this, in m/s: what the shield assumes of a car ahead."""
 STEP = 0.6
 """The ego's station is cut into pieces of at most this length, in m, each to both sides of its middle."""
 
@@ -252,7 +258,10 @@ class BentReckoning(DeadReckoning):
         measured = assumed.boxes(shown)
         states = self._corrected(measured, state)
         found = _straightened(self.kinematics, measured, states)
-        return found if tracks is None else _narrowed(found, tracks, _known(measured))
+        if tracks is None:
+            return found
+        narrowed, fits = _narrowed(found, tracks, _known(measured))
+        return _remembered(narrowed, tracks, fits, self.way)
 
     def _corrected(self, measured: Boxes, state: Tensor) -> Tensor:
         """The states [..., 9] at an observation, from those that were predicted."""
@@ -398,8 +407,10 @@ def _known(measured: Boxes) -> Tensor:
     return known
 
 
-def _narrowed(found: Boxes, tracks: Tensor, known: Tensor) -> Boxes:
+def _narrowed(found: Boxes, tracks: Tensor, known: Tensor) -> tuple[Boxes, Tensor]:
     """The boxes of other cars, each intersected with the hull of all tracks that it may belong to (`box_kernels.narrow`).
+
+    Besides, bool [..., K], which tracks a box may belong to.
 
     Args:
         found: straightened boxes [..., V, 4].
@@ -409,18 +420,79 @@ def _narrowed(found: Boxes, tracks: Tensor, known: Tensor) -> Boxes:
     low, high = found.low[..., 1:, :], found.high[..., 1:, :]
     least, most = tracks[..., 1:5], tracks[..., 5:]
     meets = (low.unsqueeze(-2) <= most.unsqueeze(-3)) & (least.unsqueeze(-3) <= high.unsqueeze(-2))
-    fits = meets.all(-1) & (tracks[..., 0] > 0).unsqueeze(-2) & (found.present[..., 1:] & known).unsqueeze(-1)
+    may_be = meets.all(-1) & (tracks[..., 0] > 0).unsqueeze(-2) & found.present[..., 1:].unsqueeze(-1)
+    fits = may_be & known.unsqueeze(-1)
     inf = torch.full_like(least, torch.inf).unsqueeze(-3)
     least = torch.where(fits.unsqueeze(-1), least.unsqueeze(-3), inf).amin(-2)
     most = torch.where(fits.unsqueeze(-1), most.unsqueeze(-3), -inf).amax(-2)
     lower, upper = torch.maximum(low, least), torch.minimum(high, most)
     common = fits.any(-1, keepdim=True) & (lower <= upper)
     low, high = torch.where(common, lower, low), torch.where(common, upper, high)
-    return Boxes(
+    boxes = Boxes(
         found.present,
         torch.cat([found.low[..., :1, :], low], -2),
         torch.cat([found.high[..., :1, :], high], -2),
     )
+    return boxes, may_be.any(-2)
+
+
+def _remembered(boxes: Boxes, tracks: Tensor, found: Tensor, way: Way) -> Boxes:
+    """The boxes with `REMEMBERED` rows more: the nearest cars ahead that were seen, are not now, and may be out of sight.
+
+    They are known by their speed across the way, which is exactly 0.
+
+    Args:
+        boxes: straightened boxes [..., V, 4].
+        tracks: of `predicted`, [..., K, 9].
+        found: bool [..., K], which tracks are seen now.
+        way: the way.
+    """
+    station, offset = (boxes.low[..., 0, 0] + boxes.high[..., 0, 0]) / 2, boxes.low[..., 0, 1]
+    first, last = station.unsqueeze(-1) + tracks[..., 1], station.unsqueeze(-1) + tracks[..., 5]
+    beside = offset.unsqueeze(-1) + (tracks[..., 2] + tracks[..., 6]) / 2
+    hidden = _hidden(way, station, offset, torch.stack([first, (first + last) / 2, last], -1), beside)
+    kept = (tracks[..., 0] > 0) & ~found & hidden & (tracks[..., 1] > 0)
+    order = torch.where(kept, tracks[..., 1], torch.inf).sort(stable=True, dim=-1).indices[..., :REMEMBERED]
+    rows = tracks.gather(-2, order.unsqueeze(-1).expand(*order.shape, tracks.shape[-1])).clone()
+    # A car that has just got out of sight slows down by what the shield assumes of a car ahead.
+    fresh, own = rows[..., 4] != rows[..., 8], boxes.low[..., :1, 2:]
+    rows[..., 3] = torch.where(fresh, (rows[..., 3] + own[..., 0] - EASED).clamp(min=0) - own[..., 0], rows[..., 3])
+    rows[..., 4] = rows[..., 8] = -own[..., 1]
+    return Boxes(
+        torch.cat([boxes.present, kept.gather(-1, order)], -1),
+        torch.cat([boxes.low, rows[..., 1:5]], -2),
+        torch.cat([boxes.high, rows[..., 5:]], -2),
+    )
+
+
+def _hidden(way: Way, station: Tensor, offset: Tensor, stations: Tensor, beside: Tensor) -> Tensor:
+    """Whether a car may be out of the sight of highway-env's ego, bool [..., K].
+
+    It sees what is ahead of it along its own lane, and little behind. A circular lane goes on as a circle: from a half circle
+    nothing is seen beyond its end.
+
+    Args:
+        way: the way.
+        station, offset: the place of the ego, [...].
+        stations: of each car the first, the middle and the last one, [..., K, 3].
+        beside: their offsets, [..., K].
+    """
+    table = Table(*(column.to(station) for column in _table(way)))
+    if way.closed:
+        station = station.remainder(way.length)
+    number = ((station.unsqueeze(-1) >= table.station).sum(-1) - 1).clamp(min=0)
+    heading, curvature, at = table.heading[number], table.curvature[number], station - table.station[number]
+    x, y = points(way, stations, beside.unsqueeze(-1))
+    sin, cos = heading.sin()[..., None, None], heading.cos()[..., None, None]
+    dx, dy = x - table.x[number][..., None, None], y - table.y[number][..., None, None]
+    turn, radius = curvature.sign()[..., None, None], 1 / torch.where(curvature == 0, 1.0, curvature.abs())[..., None, None]
+    # From the centre, in the direction of the beginning and across it.
+    outwards, onwards = turn * (dx * sin - dy * cos) + radius, dx * cos + dy * sin
+    angle = torch.atan2(onwards, outwards)
+    bent = (curvature != 0)[..., None, None]
+    along = torch.where(bent, angle * radius, onwards) - at[..., None, None]
+    longer = (1 - curvature * offset)[..., None, None]
+    return ((along * longer < IN_SIGHT) | (bent & (angle > math.pi - 0.1))).any(-1)
 
 
 def cut(car: Kinematics) -> float:
@@ -547,6 +619,17 @@ def predicted(
     ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - float(limits.rounding)
     found[..., 1] = low[..., 0] + behind * torch.where(behind >= 0, least, most) - moved.unsqueeze(-1) - slack
     found[..., 5] = high[..., 0] + ahead * torch.where(ahead >= 0, most, least) - moved.unsqueeze(-1) + slack
+    # Cars out of sight, which have no speed across the way, are assumed to drive on as they were seen (`EASED`).
+    now = after[:, motion_kernels.SPEED, None], after[:, motion_kernels.HEADING, None]
+    unseen = low[..., 3] == high[..., 3]
+    further = low[..., 0] + absolute[0][..., 1] * least * period - moved.unsqueeze(-1)
+    found[..., 1] = torch.where(unseen, further, found[..., 1])
+    found[..., 3] = torch.where(unseen, absolute[0][..., 1] - now[0] * now[1].cos(), found[..., 3])
+    for place, side in ((2, 0), (6, 1)):
+        found[..., place] = torch.where(
+            unseen, absolute[side][..., 0] - after[:, motion_kernels.Y, None], found[..., place]
+        )
+        found[..., place + 2] = torch.where(unseen, -now[0] * now[1].sin(), found[..., place + 2])
     found[..., 2] -= way.misfit * crossed
     found[..., 6] += way.misfit * crossed
     return found
