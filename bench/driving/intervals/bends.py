@@ -540,11 +540,11 @@ def paths(ego: Ego, boxes: Boxes, car: Kinematics) -> tuple[Tensor, Tensor]:
     between = _curved(way, torch.minimum(row[0], near), torch.maximum(row[1], far))
     bends = torch.maximum(between[1], most).clamp(min=0) - torch.minimum(between[0], least).clamp(max=0)
     slack = torch.maximum(left.abs(), right.abs()) * (between[1].clamp(min=0) - between[0].clamp(max=0)) * doubt / 2
-    x_low, x_high = torch.full_like(near, torch.inf), torch.full_like(near, -torch.inf)
-    for begin in (row[0], middle, row[1]):
-        for path in (left, right):
-            x_low = torch.minimum(x_low, _apart(way, begin, low[..., 0], path))
-            x_high = torch.maximum(x_high, _apart(way, begin, high[..., 0], path))
+    begins = torch.stack([row[0], middle, row[1]], -1)
+    further = torch.stack([low[..., 0], high[..., 0]], -1).unsqueeze(-1)
+    bent = turned(way, begins.unsqueeze(-2) + further) - turned(way, begins).unsqueeze(-2)
+    lengths = further.unsqueeze(-3) - torch.stack([left, right], -1)[..., None, None] * bent.unsqueeze(-3)
+    x_low, x_high = lengths[..., 0, :].amin((-1, -2)), lengths[..., 1, :].amax((-1, -2))
     longer = slack + lengthened(car) * (bends > 0)
     x_low = x_low - longer
     x_high = x_high + longer
@@ -568,11 +568,6 @@ def paths(ego: Ego, boxes: Boxes, car: Kinematics) -> tuple[Tensor, Tensor]:
         torch.stack([x_low, low[..., 1], vx_low, vy_low], -1),
         torch.stack([x_high, high[..., 1], vx_high, vy_high], -1),
     )
-
-
-def _apart(way: Way, station: Tensor, further: Tensor, offset: Tensor) -> Tensor:
-    """The length of the path at an offset from a station to one that is `further`, in m."""
-    return further - offset * (turned(way, station + further) - turned(way, station))
 
 
 def _speeds(ego: Ego) -> tuple[Tensor, Tensor]:
