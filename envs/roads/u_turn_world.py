@@ -36,7 +36,7 @@ def _road(connected: bool) -> NDArray[np.void]:
 @cache
 def _way(connected: bool) -> Way:
     """The ego starts at the beginning of the left lane."""
-    return way_round(u_turn.u_turn(connected=connected), u_turn.WAY.roads, start=(0.0, 0.0), start_lane=0)
+    return way_round(u_turn.u_turn(connected=connected), u_turn.WAY.roads, start=0.0, start_lane=0)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """A road that bends, straightened: boxes in x and y are enclosed by boxes along and across the way of the ego.
 
 A straightened box has the station along the left lane, the offset to its right, and the speeds along and across the way. As
-elsewhere, the rows of other cars are relative to the ego. The ego's own row holds its reckoned station as an interval.
+elsewhere, the rows of other cars are relative to the ego. The ego's own row holds its reckoned station.
 
 The enclosure is sound for every car whose centre is on the road or at most `ASIDE` m beside it. One that is nowhere on the road
 counts on all lanes, standing, at its straight distance: no way along the road is shorter.
@@ -21,7 +21,7 @@ from cavbench.driving.features import ActionType
 from cavbench.driving.intervals import motion_kernels, way_kernels
 from cavbench.driving.intervals.boxes import Assumed, Boxes, flat, shaped
 from cavbench.driving.intervals.ego import DeadReckoning, Ego, Step, stacked
-from cavbench.driving.intervals.way_kernels import DOUBT, PURSUIT_S, STATION
+from cavbench.driving.intervals.way_kernels import PURSUIT_S, STATION
 from cavbench.driving.kinematics import Kinematics
 from cavbench.driving.way import Way
 
@@ -31,8 +31,6 @@ FAR = 1e3
 """Beyond every road, in m."""
 ROUNDING = 0.01
 """Enclosures are wider by this on every side, in m and m/s: float32, and what a reckoned ego may be wrong by."""
-BEHIND = 30.0
-"""On a closed way a car counts as ahead, unless it is at most so far behind, in m."""
 ONWARD = 50.0
 """Bends as far ahead of a car, in m, count for what it will drive."""
 REMEMBERED = 6
@@ -41,8 +39,6 @@ IN_SIGHT = -8.0
 """A car that is less behind than this along the ego's lane is surely seen, in m (BEHIND of highway-env's observation is -10)."""
 EASED = 1.0
 """A car out of sight slows down by at most this, in m/s: what the shield assumes of a car ahead."""
-STEP = 0.6
-"""The ego's station is cut into pieces of at most this length, in m, each to both sides of its middle."""
 
 
 class Table(NamedTuple):
@@ -60,12 +56,10 @@ class Table(NamedTuple):
 
 @cache
 def _table(way: Way) -> Table:
-    """The stretches; `begin` and `end` are where each ends along itself, in m: an open way goes on beyond both of its ends."""
+    """The stretches; `begin` and `end` are where each ends along itself, in m: the way goes on beyond both of its ends."""
     rows = [(one.x, one.y, one.heading, one.curvature, at) for one, at in zip(way.stretches, way.stations, strict=True)]
     lengths = [one.length for one in way.stretches]
-    begin, end = [0.0] * len(lengths), list(lengths)
-    if not way.closed:
-        begin[0], end[-1] = -FAR, FAR
+    begin, end = [-FAR, *[0.0] * (len(lengths) - 1)], [*lengths[:-1], FAR]
     return Table(*torch.tensor(rows).unbind(-1), *map(torch.tensor, (begin, end, lengths)))
 
 
@@ -75,10 +69,7 @@ def _route(way: Way, lane_width: float) -> way_kernels.Route:
         (one.x, one.y, one.heading, one.length, one.curvature, at)
         for one, at in zip(way.stretches, way.stations, strict=True)
     ]
-    lane = -1 if way.start_lane is None else way.start_lane
-    return way_kernels.Route(
-        np.array(rows), way.closed, way.lanes, way.length, np.array(way.start, float), lane, lane_width
-    )
+    return way_kernels.Route(np.array(rows), way.lanes, way.start, way.start_lane, lane_width)
 
 
 def _within(values: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
@@ -140,9 +131,8 @@ def enclosed(way: Way, lane_width: float, low: Tensor, high: Tensor) -> Enclosur
     along_high = torch.where(bent, most * radius + table.length / 2, along.amax(-1))
     offset_low = torch.where(bent, torch.minimum(*sides), across.amin(-1))
     offset_high = torch.where(bent, torch.maximum(*sides), across.amax(-1))
-    slack = ROUNDING + way.misfit
-    band = -lane_width / 2 - ASIDE - slack, (way.lanes - 0.5) * lane_width + ASIDE + slack
-    begin, end = table.begin - slack, table.end + slack
+    band = -lane_width / 2 - ASIDE - ROUNDING, (way.lanes - 0.5) * lane_width + ASIDE + ROUNDING
+    begin, end = table.begin - ROUNDING, table.end + ROUNDING
     valid = (along_low <= end) & (along_high >= begin) & (offset_low <= band[1]) & (offset_high >= band[0])
     return Enclosure(
         valid,
@@ -185,22 +175,15 @@ def _cosines(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
 
 def directions(way: Way, station: Tensor) -> tuple[Tensor, Tensor]:
     """The direction of the way at stations [...], in rad, and its curvature there."""
-    table = Table(*(column.to(station) for column in _table(way)))
-    if way.closed:
-        station = station.remainder(way.length)
-    inside = station.unsqueeze(-1) >= table.station
-    number = (inside.sum(-1) - 1).clamp(min=0)
-    along = station - table.station[number]
-    return table.heading[number] + table.curvature[number] * along, table.curvature[number]
+    table, number = _at(way, station)
+    curvature = table.curvature[number]
+    return table.heading[number] + curvature * (station - table.station[number]), curvature
 
 
 def points(way: Way, station: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     """The points x, y of places [...]."""
-    table = Table(*(column.to(station) for column in _table(way)))
+    table, number = _at(way, station)
     heading, curvature = directions(way, station)
-    if way.closed:
-        station = station.remainder(way.length)
-    number = ((station.unsqueeze(-1) >= table.station).sum(-1) - 1).clamp(min=0)
     along, begins = station - table.station[number], table.heading[number]
     bent = curvature != 0
     safe = torch.where(bent, curvature, 1.0)
@@ -209,26 +192,24 @@ def points(way: Way, station: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
     return table.x[number] + x - offset * heading.sin(), table.y[number] + y + offset * heading.cos()
 
 
-def turned(way: Way, station: Tensor) -> Tensor:
-    """By how much the way has turned from station 0 to stations [...], in rad, over several rounds if it is closed."""
+def _at(way: Way, station: Tensor) -> tuple[Table, Tensor]:
+    """The stretches, and the number of that at each station [...]."""
     table = Table(*(column.to(station) for column in _table(way)))
-    rounds = torch.zeros_like(station)
-    if way.closed:
-        rounds = (station / way.length).floor()
-        station = station - rounds * way.length
+    return table, ((station.unsqueeze(-1) >= table.station).sum(-1) - 1).clamp(min=0)
+
+
+def turned(way: Way, station: Tensor) -> Tensor:
+    """By how much the way has turned from its beginning to stations [...], in rad."""
+    table = Table(*(column.to(station) for column in _table(way)))
     part = (station.unsqueeze(-1) - table.station).clamp(min=0).minimum(table.length)
-    return (part * table.curvature).sum(-1) + rounds * (table.length * table.curvature).sum()
+    return (part * table.curvature).sum(-1)
 
 
 def _curved(way: Way, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the largest curvature between two stations [...]."""
     table = Table(*(column.to(first) for column in _table(way)))
     first, last = first.unsqueeze(-1), last.unsqueeze(-1)
-    begin, end = table.station + table.begin, table.station + table.end
-    touched = (last >= begin) & (first <= end)
-    if way.closed:
-        for laps in (-1, 1):
-            touched = touched | ((last >= begin + laps * way.length) & (first <= end + laps * way.length))
+    touched = (last >= table.station + table.begin) & (first <= table.station + table.end)
     return _within(table.curvature.expand_as(touched), touched)
 
 
@@ -238,7 +219,7 @@ def slip(curvature: Tensor, car: Kinematics) -> Tensor:
 
 
 class BentReckoning(DeadReckoning):
-    """Dead reckoning on a way. Its states have the station and its doubt besides, [..., 9].
+    """Dead reckoning on a way. Its states have the station besides, [..., 8].
 
     The heading of its egos is the direction in which they move, from that of the way: in a bend a car points elsewhere.
     """
@@ -252,7 +233,7 @@ class BentReckoning(DeadReckoning):
         self.route = _route(self.way, kinematics.lane_width)
 
     def unknown(self, episodes: Tensor) -> Tensor:
-        return torch.zeros(len(episodes), DOUBT + 1, device=episodes.device)
+        return torch.zeros(len(episodes), STATION + 1, device=episodes.device)
 
     def boxes(self, assumed: Assumed, shown: Tensor, state: Tensor, tracks: Tensor | None = None) -> Boxes:
         measured = assumed.boxes(shown)
@@ -264,7 +245,7 @@ class BentReckoning(DeadReckoning):
         return _remembered(narrowed, tracks, fits, self.way)
 
     def _corrected(self, measured: Boxes, state: Tensor) -> Tensor:
-        """The states [..., 9] at an observation, from those that were predicted."""
+        """The states [..., 8] at an observation, from those that were predicted."""
         leading = measured.present.shape[:-1]
         states = flat(state.expand(*leading, state.shape[-1]), 1)
         own = measured.low[..., 0, :], measured.high[..., 0, :]
@@ -277,8 +258,7 @@ class BentReckoning(DeadReckoning):
 
     def step(self, boxes: Boxes, state: Tensor, action: Tensor) -> Step:
         ego = self.now(boxes, state)
-        row = boxes.low[..., 0, 0], boxes.high[..., 0, 0]
-        place = torch.stack([torch.ones_like(ego.y), (row[0] + row[1]) / 2, (row[1] - row[0]) / 2], -1)
+        place = torch.stack([torch.ones_like(ego.y), boxes.low[..., 0, 0]], -1)
         states = torch.cat([torch.stack(tuple(ego), -1), place], -1).detach()
         orders, turns = self._changes[:, action.cpu()].numpy()
         moved = flat(states, 1).copy()
@@ -289,7 +269,7 @@ class BentReckoning(DeadReckoning):
         raise NotImplementedError("on a way, `step` knows the station")
 
     def corrected(self, observation: Tensor, ego: Ego, boxes: Boxes, assumed: Assumed) -> Tensor:
-        station = (boxes.low[..., 0, 0] + boxes.high[..., 0, 0]) / 2
+        station = boxes.low[..., 0, 0]
         direction, curvature = directions(self.way, station)
         heading = direction + ego.heading - slip(curvature, self.kinematics)
         place = points(self.way, station, ego.y)
@@ -315,83 +295,50 @@ def _ego(boxes: Boxes, state: Tensor, of: BentReckoning) -> Ego:
 
 
 def _straightened(car: Kinematics, measured: Boxes, states: Tensor) -> Boxes:
-    """The boxes of a measurement, straightened."""
-    station, doubt = states[..., STATION], states[..., DOUBT]
-    course, speed = states[..., motion_kernels.HEADING], states[..., motion_kernels.SPEED]
-    pieces = (doubt / STEP).ceil().clamp(min=1)
-    low, high = _seen(car, measured, states, station - doubt + doubt / pieces, doubt / pieces)
-    for piece in range(1, int(pieces.max())):
-        # The pieces of an episode do not depend on the others of the batch.
-        counts = (piece < pieces)[..., None, None]
-        least, most = _seen(car, measured, states, station + doubt * ((2 * piece + 1) / pieces - 1), doubt / pieces)
-        low = torch.where(counts, torch.minimum(low, least), low)
-        high = torch.where(counts, torch.maximum(high, most), high)
-    own = torch.stack([station, states[..., motion_kernels.Y], speed * course.cos(), speed * course.sin()], -1)
-    unsure, still = torch.stack([doubt, *[torch.zeros_like(doubt)] * 3], -1), torch.cat([0 * own[..., :1], own[..., 1:]], -1)
-    return Boxes(
-        measured.present,
-        torch.cat([(own - unsure).unsqueeze(-2), low - still.unsqueeze(-2)], -2),
-        torch.cat([(own + unsure).unsqueeze(-2), high - still.unsqueeze(-2)], -2),
-    )
-
-
-def _seen(
-    car: Kinematics, measured: Boxes, states: Tensor, station: Tensor, half: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Bounds of the other cars, [..., V - 1, 4]: the station from that of the ego, the offset, the speeds along and across.
+    """The boxes of a measurement, straightened.
 
     Args:
         car: the kinematics, with a way.
         measured: x, y, vx and vy in the frame of the world; those of others from the ego's.
-        states: the ego, [..., 9].
-        station: the middle of where it is, [...].
-        half: by how much it may be elsewhere, in m, [...].
+        states: the ego, [..., 8].
     """
     way = car.way
     assert way is not None
+    station, offset = states[..., STATION], states[..., motion_kernels.Y]
     speed, course = states[..., motion_kernels.SPEED], states[..., motion_kernels.HEADING]
     direction, curvature = directions(way, station)
     heading = direction + course - slip(curvature, car)
-    place = torch.stack(points(way, station, states[..., motion_kernels.Y]), -1)
-    velocity = speed.unsqueeze(-1) * torch.stack([heading.cos(), heading.sin()], -1)
-    along = torch.stack([direction.cos().abs(), direction.sin().abs()], -1)
-    moved = half.unsqueeze(-1) * (along + (half * curvature.abs()).unsqueeze(-1)) + ROUNDING
-    turns = (speed * half * curvature.abs()).unsqueeze(-1) + ROUNDING
+    place = torch.stack(points(way, station, offset), -1).unsqueeze(-2)
+    velocity = (speed.unsqueeze(-1) * torch.stack([heading.cos(), heading.sin()], -1)).unsqueeze(-2)
     low, high = measured.low[..., 1:, :].clamp(min=-FAR), measured.high[..., 1:, :].clamp(max=FAR)
-    least, most = low[..., :2] + (place - moved).unsqueeze(-2), high[..., :2] + (place + moved).unsqueeze(-2)
-    slowest, fastest = low[..., 2:] + (velocity - turns).unsqueeze(-2), high[..., 2:] + (velocity + turns).unsqueeze(-2)
-    slowest, fastest = slowest.clamp(min=-car.top_speed), fastest.clamp(max=car.top_speed)
+    least, most = low[..., :2] + place - ROUNDING, high[..., :2] + place + ROUNDING
+    slowest = (low[..., 2:] + velocity - ROUNDING).clamp(min=-car.top_speed)
+    fastest = (high[..., 2:] + velocity + ROUNDING).clamp(max=car.top_speed)
     found = enclosed(way, car.lane_width, least, most)
     table = Table(*(column.to(low) for column in _table(way)))
     first, last = (table.heading + table.curvature * bound for bound in found.along)
-    first, last = torch.minimum(first, last) - way.kink, torch.maximum(first, last) + way.kink
-    speeds = projected(slowest, fastest, first, last)
-    from_ego = [table.station + bound - station[..., None, None] for bound in found.along]
-    if way.closed:
-        rounds = ((sum(from_ego) / 2 + BEHIND) / way.length).floor() * way.length
-        from_ego = [bound - rounds for bound in from_ego]
-    slack = half[..., None, None]
-    bounds = [
-        _within(from_ego[0] - slack, found.valid)[0],
-        _within(found.offset[0], found.valid)[0],
-        _within(speeds[0], found.valid)[0],
-        _within(speeds[2], found.valid)[0],
-        _within(from_ego[1] + slack, found.valid)[1],
-        _within(found.offset[1], found.valid)[1],
-        _within(speeds[1], found.valid)[1],
-        _within(speeds[3], found.valid)[1],
-    ]
+    speeds = projected(slowest, fastest, torch.minimum(first, last), torch.maximum(first, last))
+    begins, ends = (table.station + bound - station[..., None, None] for bound in found.along)
+    pairs = ((begins, ends), found.offset, speeds[:2], speeds[2:])
+    bounds = [[_within(pair[side], found.valid)[side] for pair in pairs] for side in (0, 1)]
     # Nowhere on the road: on all lanes, standing, no farther along the road than it is.
-    apart = torch.maximum((least - place.unsqueeze(-2)), (place.unsqueeze(-2) - most)).clamp(min=0)
-    nearest = (apart**2).sum(-1).add(1e-12).sqrt()
+    nearest = torch.maximum(least - place, place - most).clamp(min=0)
     beside = ASIDE + car.lane_width / 2
-    right = (way.lanes - 1) * car.lane_width + beside
-    lost = nearest, -beside, 0.0, 0.0, FAR, right, 0.0, 0.0
+    lost = (
+        ((nearest**2).sum(-1).add(1e-12).sqrt(), -beside, 0.0, 0.0),
+        (FAR, (way.lanes - 1) * car.lane_width + beside, 0.0, 0.0),
+    )
     on_road = found.valid.any(-1)
-    rows = [
-        torch.where(on_road, bound, torch.as_tensor(other).to(bound)) for bound, other in zip(bounds, lost, strict=True)
-    ]
-    return torch.stack(rows[:4], -1), torch.stack(rows[4:], -1)
+    own = torch.stack([torch.zeros_like(station), offset, speed * course.cos(), speed * course.sin()], -1).unsqueeze(-2)
+    row = torch.cat([station[..., None, None], own[..., 1:]], -1)
+    sides = []
+    for known, other in zip(bounds, lost, strict=True):
+        columns = [
+            torch.where(on_road, bound, torch.as_tensor(value).to(bound))
+            for bound, value in zip(known, other, strict=True)
+        ]
+        sides.append(torch.cat([row, torch.stack(columns, -1) - own], -2))
+    return Boxes(measured.present, *sides)
 
 
 def _known(measured: Boxes) -> Tensor:
@@ -447,7 +394,7 @@ def _remembered(boxes: Boxes, tracks: Tensor, found: Tensor, way: Way) -> Boxes:
         found: bool [..., K], which tracks are seen now.
         way: the way.
     """
-    station, offset = (boxes.low[..., 0, 0] + boxes.high[..., 0, 0]) / 2, boxes.low[..., 0, 1]
+    station, offset = boxes.low[..., 0, 0], boxes.low[..., 0, 1]
     first, last = station.unsqueeze(-1) + tracks[..., 1], station.unsqueeze(-1) + tracks[..., 5]
     beside = offset.unsqueeze(-1) + (tracks[..., 2] + tracks[..., 6]) / 2
     hidden = _hidden(way, station, offset, torch.stack([first, (first + last) / 2, last], -1), beside)
@@ -477,10 +424,7 @@ def _hidden(way: Way, station: Tensor, offset: Tensor, stations: Tensor, beside:
         stations: of each car the first, the middle and the last one, [..., K, 3].
         beside: their offsets, [..., K].
     """
-    table = Table(*(column.to(station) for column in _table(way)))
-    if way.closed:
-        station = station.remainder(way.length)
-    number = ((station.unsqueeze(-1) >= table.station).sum(-1) - 1).clamp(min=0)
+    table, number = _at(way, station)
     heading, curvature, at = table.heading[number], table.curvature[number], station - table.station[number]
     x, y = points(way, stations, beside.unsqueeze(-1))
     sin, cos = heading.sin()[..., None, None], heading.cos()[..., None, None]
@@ -531,23 +475,18 @@ def paths(ego: Ego, boxes: Boxes, car: Kinematics) -> tuple[Tensor, Tensor]:
     assert way is not None
     own = torch.stack([torch.zeros_like(ego.y), ego.y, *_speeds(ego)], -1).unsqueeze(-2)
     low, high = boxes.low[..., 1:, :] + own, boxes.high[..., 1:, :] + own
-    row = boxes.low[..., :1, 0], boxes.high[..., :1, 0]
-    middle, doubt = (row[0] + row[1]) / 2, (row[1] - row[0]) / 2
+    station = boxes.low[..., :1, 0]
     cuts, offset = cut(car), ego.y.unsqueeze(-1)
     left, right = torch.minimum(low[..., 1] - cuts, offset), torch.maximum(high[..., 1] + cuts, offset)
-    near, far = row[0] + low[..., 0], row[1] + high[..., 0]
+    near, far = station + low[..., 0], station + high[..., 0]
     least, most = _curved(way, near, far + ONWARD)
-    between = _curved(way, torch.minimum(row[0], near), torch.maximum(row[1], far))
+    between = _curved(way, torch.minimum(station, near), torch.maximum(station, far))
     bends = torch.maximum(between[1], most).clamp(min=0) - torch.minimum(between[0], least).clamp(max=0)
-    slack = torch.maximum(left.abs(), right.abs()) * (between[1].clamp(min=0) - between[0].clamp(max=0)) * doubt / 2
-    begins = torch.stack([row[0], middle, row[1]], -1)
-    further = torch.stack([low[..., 0], high[..., 0]], -1).unsqueeze(-1)
-    bent = turned(way, begins.unsqueeze(-2) + further) - turned(way, begins).unsqueeze(-2)
-    lengths = further.unsqueeze(-3) - torch.stack([left, right], -1)[..., None, None] * bent.unsqueeze(-3)
-    x_low, x_high = lengths[..., 0, :].amin((-1, -2)), lengths[..., 1, :].amax((-1, -2))
-    longer = slack + lengthened(car) * (bends > 0)
-    x_low = x_low - longer
-    x_high = x_high + longer
+    bent = turned(way, torch.stack([near, far], -1)) - turned(way, station).unsqueeze(-1)
+    lengths = torch.stack([low[..., 0], high[..., 0]], -1).unsqueeze(-2)
+    lengths = lengths - torch.stack([left, right], -1).unsqueeze(-1) * bent.unsqueeze(-2)
+    longer = lengthened(car) * (bends > 0)
+    x_low, x_high = lengths[..., 0].amin(-1) - longer, lengths[..., 1].amax(-1) + longer
     # As fast as the car goes on its own path, it goes by less along a longer one.
     to_left, to_right = left - high[..., 1], right - low[..., 1]
     shares = [
@@ -586,19 +525,17 @@ def predicted(
     assert way is not None
     period = float(limits.period)
     row = boxes.low[:, 0].detach(), boxes.high[:, 0].detach()
-    station, own = (row[0][:, 0] + row[1][:, 0]) / 2, row[0][:, None, 1:]
+    station, own = row[0][:, 0], row[0][:, None, 1:]
     low, high = boxes.low[:, 1:].detach(), boxes.high[:, 1:].detach()
     absolute = low[..., 1:] + own, high[..., 1:] + own
     largest = torch.maximum(absolute[0].abs(), absolute[1].abs())
     fastest = torch.hypot(largest[..., 1], largest[..., 2]) + float(limits.gained)
-    reach = car.top_speed * period + ROUNDING + way.misfit
-    first, last = row[0][:, :1] + low[..., 0] - reach, row[1][:, :1] + high[..., 0] + reach
-    curvatures = _curved(way, first, last)
+    reach = car.top_speed * period + ROUNDING
+    curvatures = _curved(way, station[:, None] + low[..., 0] - reach, station[:, None] + high[..., 0] + reach)
     sides = absolute[0][..., 0] - ASIDE, absolute[1][..., 0] + ASIDE
     shares = torch.stack([1 / (1 - one * side).clamp(min=0.1) for one in curvatures for side in sides], -1)
     least, most = shares.amin(-1), shares.amax(-1)
-    crossed = _crossed(way, first, last) | _crossed(way, station - reach, station + reach).unsqueeze(-1)
-    turn = torch.maximum(curvatures[0].abs(), curvatures[1].abs()) * most * fastest * period + way.kink * crossed
+    turn = torch.maximum(curvatures[0].abs(), curvatures[1].abs()) * most * fastest * period
     swing = (turn * fastest).unsqueeze(-1) * torch.tensor([0.0, 0.0, 0.0, 1.0])
     given = flat(torch.cat([row[0].unsqueeze(1), low - swing], 1), 2), flat(torch.cat([row[1].unsqueeze(1), high + swing], 1), 2)
     tracks = np.empty((len(low), low.shape[1], 9), np.float32)
@@ -606,12 +543,9 @@ def predicted(
     found = torch.from_numpy(tracks)
     # What the loop added to the stations is undone, and added as far as the left lane gets longer by it.
     driven = (before.speed + after[:, motion_kernels.SPEED]) / 2 * before.heading.cos() * period
-    moved = after[:, STATION] - station
-    if way.closed:
-        moved = moved - (moved / way.length).round() * way.length
-    slack = float(limits.rounding) + way.misfit * crossed
-    behind = found[..., 1] + driven.unsqueeze(-1) - low[..., 0] + float(limits.rounding)
-    ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - float(limits.rounding)
+    moved, slack = after[:, STATION] - station, float(limits.rounding)
+    behind = found[..., 1] + driven.unsqueeze(-1) - low[..., 0] + slack
+    ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - slack
     found[..., 1] = low[..., 0] + behind * torch.where(behind >= 0, least, most) - moved.unsqueeze(-1) - slack
     found[..., 5] = high[..., 0] + ahead * torch.where(ahead >= 0, most, least) - moved.unsqueeze(-1) + slack
     # Cars out of sight, which have no speed across the way, are assumed to drive on as they were seen (`EASED`).
@@ -625,14 +559,4 @@ def predicted(
             unseen, absolute[side][..., 0] - after[:, motion_kernels.Y, None], found[..., place]
         )
         found[..., place + 2] = torch.where(unseen, -now[0] * now[1].sin(), found[..., place + 2])
-    found[..., 2] -= way.misfit * crossed
-    found[..., 6] += way.misfit * crossed
     return found
-
-
-def _crossed(way: Way, first: Tensor, last: Tensor) -> Tensor:
-    """Whether there is a misfit between two stations, bool [...]."""
-    if way.misfit == 0 and way.kink == 0:
-        return torch.zeros_like(first, dtype=torch.bool)
-    joints = torch.tensor([at + lap * way.length for lap in ((-1, 0, 1) if way.closed else (0,)) for at in way.stations])
-    return ((first.unsqueeze(-1) <= joints) & (last.unsqueeze(-1) >= joints)).any(-1)

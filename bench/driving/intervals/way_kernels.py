@@ -13,16 +13,12 @@ from cavbench.driving.intervals.kernels import Floats
 from cavbench.driving.intervals.motion_kernels import EDGE, HEADING, KNOWN, LANE, SLACK, SPEED, TARGET, Car
 from cavbench.driving.intervals.motion_kernels import Y as OFFSET
 
-STATION, DOUBT = 7, 8
-"""Further fields of a state on a way: the station in m, and by how much it may be wrong, in m."""
+STATION = 7
+"""A further field of a state on a way: the station in m."""
 PURSUIT_S = 0.1
 """highway-env's cars steer towards the direction that the lane will have after this time (TAU_PURSUIT of controller.py)."""
 END_M = 2.5
 """They follow the next stretch from so far before the end of a lane on (AbstractLane.after_end of road/lane.py)."""
-SAMPLES = 65
-"""Stations that are compared with a measurement."""
-BESIDE_M = 0.3
-"""A reckoned offset may be wrong by this where a measurement is compared, in m."""
 LOST_M = 30.0
 """A station that contradicts the measurement is looked for so far to both sides, in m."""
 
@@ -32,17 +28,13 @@ class Route(NamedTuple):
 
     Args:
         rows: of each stretch x, y, heading, length, curvature and station, [P, 6].
-        closed, lanes, length: as there.
-        start: as there, [2].
-        start_lane: as there; -1 for None.
+        lanes, start, start_lane: as there.
         lane_width: in m.
     """
 
     rows: NDArray[np.float64]
-    closed: bool
     lanes: int
-    length: float
-    start: NDArray[np.float64]
+    start: float
     start_lane: int
     lane_width: float
 
@@ -60,12 +52,6 @@ def _stretch(route: Route, station: float) -> int:
         if station >= route.rows[number, 5]:
             found = number
     return found
-
-
-@inner
-def _onto(route: Route, station: float) -> float:
-    """The station between 0 and the length, if the way is closed."""
-    return station % route.length if route.closed else station
 
 
 @inner
@@ -103,13 +89,13 @@ def _place(route: Route, number: int, x: float, y: float) -> tuple[float, float]
     """Station and offset of a point on or next to a stretch."""
     last = len(route.rows) - 1
     along, offset = _local(route, number, x, y)
-    if along < 0 and (number > 0 or route.closed):
-        number = number - 1 if number > 0 else last
+    if along < 0 and number > 0:
+        number -= 1
         along, offset = _local(route, number, x, y)
-    elif along > route.rows[number, 3] and (number < last or route.closed):
-        number = number + 1 if number < last else 0
+    elif along > route.rows[number, 3] and number < last:
+        number += 1
         along, offset = _local(route, number, x, y)
-    return _onto(route, route.rows[number, 5] + along), offset
+    return route.rows[number, 5] + along, offset
 
 
 @inner
@@ -126,24 +112,8 @@ def _beside(low: float, value: float, high: float) -> float:
 @inner
 def _apart(route: Route, station: float, offset: float, low: Floats, high: Floats) -> float:
     """How far a place is from a box, in m, by the larger one of x and y."""
-    x, y, _ = _point(route, _onto(route, station), offset)
+    x, y, _ = _point(route, station, offset)
     return max(_beside(low[0], x, high[0]), _beside(low[1], y, high[1]))
-
-
-@inner
-def _narrowed(
-    route: Route, first: float, last: float, offset: float, low: Floats, high: Floats
-) -> tuple[float, float, float]:
-    """The stations from `first` to `last` that fit a measured box, and how far the nearest one is from it, in m."""
-    spacing = (last - first) / (SAMPLES - 1)
-    least, most, nearest = np.inf, -np.inf, np.inf
-    for number in range(SAMPLES):
-        station = first + number * spacing
-        apart = _apart(route, station, offset, low, high)
-        nearest = min(nearest, apart)
-        if apart <= spacing + BESIDE_M:
-            least, most = min(least, station - spacing), max(most, station + spacing)
-    return max(least, first), min(most, last), nearest
 
 
 @inner
@@ -154,15 +124,15 @@ def _found(route: Route, station: float, offset: float, low: Floats, high: Float
         apart = _apart(route, station + number, offset, low, high)
         if apart < least:
             best, least = station + number, apart
-    return _onto(route, best)
+    return best
 
 
 @entry_point
 def corrected(states: Floats, low: Floats, high: Floats, car: Car, route: Route, now: Floats) -> None:
-    """The egos at an observation; fills `now` [N, 9], states.
+    """The egos at an observation; fills `now` [N, 8], states.
 
     Args:
-        states: the predicted egos [N, 9].
+        states: the predicted egos [N, 8].
         low, high: the box of the measured row, x, y, vx and vy in the frame of the world, [N, 4].
         car: the kinematics.
         route: the way.
@@ -170,14 +140,13 @@ def corrected(states: Floats, low: Floats, high: Floats, car: Car, route: Route,
     for n in range(len(states)):
         now[n] = states[n]
         if not states[n, KNOWN] > 0:
-            _begin(route, low[n], high[n], car, now[n])
+            now[n, OFFSET], now[n, HEADING], now[n, SPEED] = route.start_lane * route.lane_width, 0.0, car.start_speed
+            now[n, LANE], now[n, TARGET], now[n, EDGE] = route.start_lane, car.start_speed, route.lanes - 1
+            now[n, STATION] = route.start
             continue
-        station, doubt, offset = float(states[n, STATION]), float(states[n, DOUBT]), float(states[n, OFFSET])
-        first, last, nearest = _narrowed(route, station - doubt, station + doubt, offset, low[n], high[n])
-        if nearest > SLACK:
+        station, offset = float(states[n, STATION]), float(states[n, OFFSET])
+        if _apart(route, station, offset, low[n], high[n]) > SLACK:
             now[n, STATION] = _found(route, station, offset, low[n], high[n])
-        elif first <= last:
-            now[n, STATION], now[n, DOUBT] = _onto(route, (first + last) / 2), (last - first) / 2
         _, _, heading = _point(route, station, offset)
         heading += states[n, HEADING] - slip(route.rows[_stretch(route, station), 4], car)
         cos, sin = math.cos(heading), math.sin(heading)
@@ -187,31 +156,9 @@ def corrected(states: Floats, low: Floats, high: Floats, car: Car, route: Route,
             now[n, SPEED] = min(max(float(states[n, SPEED]), least - SLACK), most + SLACK)
 
 
-@inner
-def _begin(route: Route, low: Floats, high: Floats, car: Car, now: Floats) -> None:
-    """The ego at its first observation."""
-    lane, least = max(route.start_lane, 0), np.inf
-    if route.start_lane < 0:
-        for number in range(route.lanes):
-            _, _, apart = _narrowed(route, route.start[0], route.start[1], number * route.lane_width, low, high)
-            # Of lanes that fit, the one nearest to the middle of what was measured.
-            x, y, heading = _point(route, route.start[0], number * route.lane_width)
-            middle_x, middle_y = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
-            apart += 1e-3 * abs((middle_y - y) * math.cos(heading) - (middle_x - x) * math.sin(heading))
-            if apart < least:
-                lane, least = number, apart
-    offset = lane * route.lane_width
-    first, last, _ = _narrowed(route, route.start[0], route.start[1], offset, low, high)
-    if first > last:
-        first, last = route.start[0], route.start[1]
-    now[OFFSET], now[HEADING], now[SPEED] = offset, 0.0, car.start_speed
-    now[LANE], now[TARGET], now[EDGE] = lane, car.start_speed, route.lanes - 1
-    now[STATION], now[DOUBT] = (first + last) / 2, (last - first) / 2
-
-
 @entry_point
 def driven(states: Floats, orders: NDArray[np.int64], turns: NDArray[np.int64], car: Car, route: Route) -> None:
-    """The egos, states [N, 9], one decision later, in place.
+    """The egos, states [N, 8], one decision later, in place.
 
     Args:
         states: the egos now.
@@ -261,10 +208,7 @@ def _steering(
     middle = lane * route.lane_width
     row = route.rows[number]
     if (row[3] - (station - row[5])) * (1 - row[4] * middle) < END_M:
-        if number + 1 < len(route.rows):
-            number += 1
-        elif route.closed:
-            number = 0
+        number = min(number + 1, len(route.rows) - 1)
         row = route.rows[number]
     along, offset = _local(route, number, x, y)
     ahead = row[2] + row[4] * (along + speed * PURSUIT_S / (1 - row[4] * middle))
