@@ -37,8 +37,6 @@ REMEMBERED = 6
 """Number of cars out of sight that the tracker remembers."""
 IN_SIGHT = -8.0
 """A car that is less behind than this along the ego's lane is surely seen, in m (BEHIND of highway-env's observation is -10)."""
-EASED = 1.0
-"""A car out of sight slows down by at most this, in m/s: what the shield assumes of a car ahead."""
 
 
 class Table(NamedTuple):
@@ -401,10 +399,7 @@ def _remembered(boxes: Boxes, tracks: Tensor, found: Tensor, way: Way) -> Boxes:
     kept = (tracks[..., 0] > 0) & ~found & hidden & (tracks[..., 1] > 0)
     order = torch.where(kept, tracks[..., 1], torch.inf).sort(stable=True, dim=-1).indices[..., :REMEMBERED]
     rows = tracks.gather(-2, order.unsqueeze(-1).expand(*order.shape, tracks.shape[-1])).clone()
-    # A car that has just got out of sight slows down by what the shield assumes of a car ahead.
-    fresh, own = rows[..., 4] != rows[..., 8], boxes.low[..., :1, 2:]
-    rows[..., 3] = torch.where(fresh, (rows[..., 3] + own[..., 0] - EASED).clamp(min=0) - own[..., 0], rows[..., 3])
-    rows[..., 4] = rows[..., 8] = -own[..., 1]
+    rows[..., 4] = rows[..., 8] = -boxes.low[..., :1, 3]
     return Boxes(
         torch.cat([boxes.present, kept.gather(-1, order)], -1),
         torch.cat([boxes.low, rows[..., 1:5]], -2),
@@ -548,13 +543,15 @@ def predicted(
     ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - slack
     found[..., 1] = low[..., 0] + behind * torch.where(behind >= 0, least, most) - moved.unsqueeze(-1) - slack
     found[..., 5] = high[..., 0] + ahead * torch.where(ahead >= 0, most, least) - moved.unsqueeze(-1) + slack
-    # Cars out of sight, which have no speed across the way, are assumed to drive on as they were seen (`EASED`).
+    # Cars out of sight, which have no speed across the way, keep their lane, and may brake or gain speed as any car.
     now = after[:, motion_kernels.SPEED, None], after[:, motion_kernels.HEADING, None]
     unseen = low[..., 3] == high[..., 3]
-    further = low[..., 0] + absolute[0][..., 1] * least * period - moved.unsqueeze(-1)
-    found[..., 1] = torch.where(unseen, further, found[..., 1])
-    found[..., 3] = torch.where(unseen, absolute[0][..., 1] - now[0] * now[1].cos(), found[..., 3])
-    for place, side in ((2, 0), (6, 1)):
+    speeds = [(absolute[0][..., 1] - float(limits.gained)).clamp(min=0)]
+    speeds.append((absolute[1][..., 1] + float(limits.gained)).clamp(max=car.top_speed))
+    for place, side, share in ((2, 0, least), (6, 1, most)):
+        further = (low, high)[side][..., 0] + speeds[side] * share * period - moved.unsqueeze(-1)
+        found[..., place - 1] = torch.where(unseen, further, found[..., place - 1])
+        found[..., place + 1] = torch.where(unseen, speeds[side] - now[0] * now[1].cos(), found[..., place + 1])
         found[..., place] = torch.where(
             unseen, absolute[side][..., 0] - after[:, motion_kernels.Y, None], found[..., place]
         )
