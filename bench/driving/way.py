@@ -54,7 +54,7 @@ class Way:
     Args:
         stretches: in driving order.
         lanes: number of lanes; lane i has the offset i times `Kinematics.lane_width`.
-        start, start_lane: the station and the lane at which the ego starts, in every episode. A measurement of them can be forged.
+        start, start_lane: the station and the lane at which the ego starts, in every episode. A measurement can be forged.
 
     Raises:
         ValueError: if the first or the last stretch is not straight, or one does not begin where the one before ends.

@@ -95,7 +95,9 @@ class Filter(IntervalPolicy):
         assert state is not None
         boxes = self.boxes(observation, state)
         ego = self.ego(boxes, state)
-        return self.policy.value(self.reckoning.corrected(observation, ego, boxes, self.assumed), action, state.get("inner", None))
+        return self.policy.value(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), action, state.get("inner", None)
+        )
 
     def ego(self, boxes: Boxes, state: TensorDictBase) -> Ego:
         return self.reckoning.now(boxes, state["ego"])
@@ -115,7 +117,9 @@ class Shielded(Filter):
             found = self.mask(observation, boxes, state["ego"])
             return self.mask.lowered(self.policy.scores(found.seen, state.get("inner", None)), found)
         ego = self.ego(boxes, state)
-        values = self.policy.scores(self.reckoning.corrected(observation, ego, boxes, self.assumed), state.get("inner", None))
+        values = self.policy.scores(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), state.get("inner", None)
+        )
         allowed = self.allowed(self.margins(ego, boxes))
         # The masked values are below the others; no step of this hides the victim's gradient.
         spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
@@ -127,7 +131,10 @@ class Shielded(Filter):
             found = self.mask(observation, boxes, state["ego"])
             return Passed(found.seen, found.hard[..., self.reckoning.order] > 0)
         ego = self.ego(boxes, state)
-        return Passed(self.reckoning.corrected(observation, ego, boxes, self.assumed), self.allowed(self.margins(ego, boxes)) > 0.5)
+        return Passed(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed),
+            self.allowed(self.margins(ego, boxes)) > 0.5,
+        )
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
@@ -176,7 +183,9 @@ class ShieldedControls(Filter):
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
         ego = self.ego(boxes, state)
-        wanted = self.policy.scores(self.reckoning.corrected(observation, ego, boxes, self.assumed), state.get("inner", None))
+        wanted = self.policy.scores(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), state.get("inner", None)
+        )
         left = self.corridor(ego, boxes, state)
         # The gradient of the bound that holds, and that of the victim as if there were none (straight-through).
         return torch.minimum(torch.maximum(wanted.detach(), left.low), left.high) + wanted - wanted.detach()
@@ -185,7 +194,9 @@ class ShieldedControls(Filter):
         assert state is not None
         ego = self.ego(boxes, state)
         left = self.corridor(ego, boxes, state)
-        return Passed(self.reckoning.corrected(observation, ego, boxes, self.assumed), torch.stack([left.low, left.high], -2))
+        return Passed(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), torch.stack([left.low, left.high], -2)
+        )
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None

@@ -424,7 +424,10 @@ def _hidden(way: Way, station: Tensor, offset: Tensor, stations: Tensor, beside:
     x, y = points(way, stations, beside.unsqueeze(-1))
     sin, cos = heading.sin()[..., None, None], heading.cos()[..., None, None]
     dx, dy = x - table.x[number][..., None, None], y - table.y[number][..., None, None]
-    turn, radius = curvature.sign()[..., None, None], 1 / torch.where(curvature == 0, 1.0, curvature.abs())[..., None, None]
+    turn, radius = (
+        curvature.sign()[..., None, None],
+        1 / torch.where(curvature == 0, 1.0, curvature.abs())[..., None, None],
+    )
     # From the centre, in the direction of the beginning and across it.
     outwards, onwards = turn * (dx * sin - dy * cos) + radius, dx * cos + dy * sin
     angle = torch.atan2(onwards, outwards)
@@ -452,7 +455,7 @@ def lengthened(car: Kinematics) -> float:
     """
     assert car.way is not None
     outermost = (car.way.lanes - 1) * car.lane_width
-    longest = max((abs(one.curvature) / (1 - max(one.curvature * outermost, 0.0)) for one in car.way.stretches))
+    longest = max(abs(one.curvature) / (1 - max(one.curvature * outermost, 0.0)) for one in car.way.stretches)
     if longest == 0:
         return 0.0
     radius = 1 / longest - cut(car)
@@ -508,9 +511,7 @@ def _speeds(ego: Ego) -> tuple[Tensor, Tensor]:
     return ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
 
 
-def predicted(
-    boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, limits: motion_kernels.Limits
-) -> Tensor:
+def predicted(boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, limits: motion_kernels.Limits) -> Tensor:
     """`tracks.predicted` on a way: the other cars one decision later, [B, V - 1, 9], without a gradient.
 
     The compiled loop moves them as on a straight road. What the bend changes comes on top: the direction of the way turns under
@@ -532,7 +533,10 @@ def predicted(
     least, most = shares.amin(-1), shares.amax(-1)
     turn = torch.maximum(curvatures[0].abs(), curvatures[1].abs()) * most * fastest * period
     swing = (turn * fastest).unsqueeze(-1) * torch.tensor([0.0, 0.0, 0.0, 1.0])
-    given = flat(torch.cat([row[0].unsqueeze(1), low - swing], 1), 2), flat(torch.cat([row[1].unsqueeze(1), high + swing], 1), 2)
+    given = (
+        flat(torch.cat([row[0].unsqueeze(1), low - swing], 1), 2),
+        flat(torch.cat([row[1].unsqueeze(1), high + swing], 1), 2),
+    )
     tracks = np.empty((len(low), low.shape[1], 9), np.float32)
     motion_kernels.later(flat(boxes.present, 1), *given, stacked(before).numpy(), flat(after, 1), limits, tracks)
     found = torch.from_numpy(tracks)

@@ -101,7 +101,7 @@ def _place(route: Route, number: int, x: float, y: float) -> tuple[float, float]
 @inner
 def slip(curvature: float, car: Car) -> float:
     """By how much a car that follows a curve points to the outside of where it moves, in rad: the bicycle model."""
-    return math.asin(min(max(car.half_length * curvature, -1.0), 1.0))
+    return math.asin(min(max(float(car.half_length) * curvature, -1.0), 1.0))
 
 
 @inner
@@ -217,4 +217,4 @@ def _steering(
     wanted = ahead + min(max(math.asin(share), -car.max_heading), car.max_heading)
     rate = car.heading_gain * _wrapped(wanted - heading)
     sideways = math.asin(min(max(car.half_length / moving * rate, -1.0), 1.0))
-    return min(max(math.atan(2 * math.tan(sideways)), -car.max_steering), car.max_steering)
+    return min(max(math.atan(2 * math.tan(sideways)), -float(car.max_steering)), float(car.max_steering))

@@ -17,7 +17,7 @@ from cavbench.core.pair import choose
 from cavbench.defenses.driving.shield import Shield, Shielded
 from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import Control, ObservationThreat
-from cavbench.driving.intervals.bends import REMEMBERED, enclosed, points, projected
+from cavbench.driving.intervals.bends import REMEMBERED, directions, enclosed, points, projected, slip
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.policy import reckoning
 from cavbench.driving.intervals.rooms import cars_of
@@ -159,6 +159,16 @@ def test_nobody_who_keeps_to_the_assumptions_is_hit_round_the_half_circle(attack
     assert (columns["safe_progress"] > 0.4).all()
 
 
+def alone(state: Tensor) -> Tensor:
+    """An observation [1, 10, 5] of the ego of a state [1, 8], and of nobody else."""
+    offset, course, speed, *_, station = state[0]
+    direction, curvature = directions(WAY, station)
+    heading = direction + course - slip(curvature, CAR)
+    own = torch.stack([*points(WAY, station, offset), speed * heading.cos(), speed * heading.sin()])
+    row = torch.cat([torch.ones(1), FACTS.features.normalised(own)])
+    return torch.cat([row.unsqueeze(0), torch.zeros(9, 5)]).unsqueeze(0)
+
+
 def test_a_car_that_gets_out_of_sight_is_remembered() -> None:
     """From within the half circle highway-env's ego sees nothing beyond its end."""
     policy = Tracked(Tracker(), Shielded(Shield(), Fastest(), FACTS), FACTS)
@@ -172,22 +182,17 @@ def test_a_car_that_gets_out_of_sight_is_remembered() -> None:
     state = torch.tensor([[0.0, 0.0, 16.0, 0.0, 16.0, 1.0, 1.0, 170.0]])
     step = moves.step(Boxes(present, low, high), state, torch.tensor([1]))
     tracks = predicted(Boxes(present, low, high), *step, CAR, policy.period)
-    nothing = torch.zeros(1, 10, 5)
-    own = torch.tensor([*points(WAY, step.after[0, 7], step.after[0, 0]), 0.0, 0.0])
-    nothing[0, 0, 0], nothing[0, 0, 1:] = 1, FACTS.features.normalised(own)
-    boxes = moves.boxes(policy.assumed, nothing, step.after, tracks)
+    boxes = moves.boxes(policy.assumed, alone(step.after), step.after, tracks)
     assert boxes.present.shape == (1, 10 + REMEMBERED)
     assert boxes.present[0, 10:].sum() == 1
     # It may have stopped behind the end of the half circle.
     for _ in range(20):
         step = moves.step(boxes, step.after, torch.tensor([4]))
         tracks = predicted(boxes, *step, CAR, policy.period)
-        own = torch.tensor([*points(WAY, step.after[0, 7], step.after[0, 0]), 0.0, 0.0])
-        nothing[0, 0, 1:] = FACTS.features.normalised(own)
-        boxes = moves.boxes(policy.assumed, nothing, step.after, tracks)
+        boxes = moves.boxes(policy.assumed, alone(step.after), step.after, tracks)
     assert boxes.present[0, 10:].sum() == 1
     stands, own = float(boxes.low[0, 10, 0] + boxes.low[0, 0, 0]), boxes.low[0, 0, 2]
-    assert 189 < stands < 192
+    assert 190 < stands < 193
     assert float(boxes.low[0, 10, 2] + own) == pytest.approx(0, abs=1e-4)
     assert float(boxes.high[0, 10, 0] + boxes.low[0, 0, 0]) > 199
     assert float(cars_of(moves.now(boxes, step.after), boxes, CAR).low[0, 9, 0]) < stands - float(step.after[0, 7])
