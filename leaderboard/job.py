@@ -3,14 +3,17 @@
     python -m cavbench.leaderboard.job --list       # what is missing, and what it costs
     python -m cavbench.leaderboard.job --hours 2    # the rows that fit in two hours of CPU; `make publish` drives them all
 
-A row is whole when it has the suite, the trainings and the scenarios of its grid. What is driven is kept in a folder of the row
-until then: a job that was killed goes on where it was. The published files are the state of the job.
+A row is whole when it has the suite, the trainings and the scenarios of its grid. Networks that the zoo lacks are trained first.
+What is driven is kept in a folder of the row until it is whole: a job that was killed goes on where it was.
+The published files are the state of the job.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import shlex
+import statistics
 import subprocess
 import sys
 import tomllib
@@ -24,6 +27,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from cavbench import zoo
 from cavbench.leaderboard.published import HOME, publish
 from cavbench.run.config import plan_of
 from cavbench.run.cost import spoken
@@ -82,18 +86,65 @@ class Wanted:
         )
         return ", ".join(f"{there} of {asked} {noun}" for noun, there, asked in parts if there < asked)
 
+    @cached_property
+    def trainings(self) -> Trainings:
+        """What the zoo lacks for it."""
+        pair = self.plan.pairs[0]
+        defense = pair.defense.component if pair.defense.component.learns else None
+        if not (pair.is_seeded and (defense or pair.victim.component.learns)):
+            return Trainings(None, ())
+        recipe = zoo.Recipe.of(pair.victim.component, defense)
+        there = zoo.seeds(recipe)
+        return Trainings(recipe, tuple(seed for seed in self.plan.seeds if seed not in there))
+
+    @property
+    def cpu_s(self) -> float:
+        """What it costs at most, in CPU seconds."""
+        return self.trainings.cpu_s + self.plan.cost.cpu_s
+
     def drive(self) -> bool:
-        """Drive and publish it; whether that went well."""
+        """Train what is missing, drive and publish it; whether that went well."""
+        if not all(ended(command) for command in self.trainings.commands):
+            return False
         if not driven([*ALWAYS, *self.words, f"out={self.folder}"]):
             return False
         publish(self.folder, self.home, add=True)
         return True
 
 
+@dataclass(frozen=True)
+class Trainings:
+    """The trainings that the zoo lacks for a row.
+
+    Args:
+        recipe: what is trained; None for what does not learn.
+        seeds: the training seeds.
+    """
+
+    recipe: zoo.Recipe | None
+    seeds: tuple[int, ...]
+
+    @property
+    def cpu_s(self) -> float:
+        """What they cost in CPU seconds: each the mean of those in the zoo, or nothing if there is none."""
+        if self.recipe is None or not (there := zoo.seeds(self.recipe)):
+            return 0.0
+        return len(self.seeds) * statistics.mean(zoo.card(self.recipe, seed)["cpu_seconds"] for seed in there)
+
+    @property
+    def commands(self) -> list[list[str]]:
+        """The words of `bench` that train each."""
+        return [] if self.recipe is None else [shlex.split(self.recipe.train(seed))[1:] for seed in self.seeds]
+
+
 def driven(words: Sequence[str]) -> bool:
     """Drive a run in a process of its own; whether that went well."""
-    command = [sys.executable, "-m", "cavbench", "run", *words, "--yes"]
-    return subprocess.run(command, stdout=subprocess.DEVNULL).returncode == 0
+    return ended(["run", *words, "--yes"])
+
+
+def ended(words: Sequence[str]) -> bool:
+    """Run `bench` in a process of its own; whether that went well."""
+    return subprocess.run([sys.executable, "-m", "cavbench", *words], stdout=subprocess.DEVNULL).returncode == 0
 
 
 def wanted_rows(home: Path, out: Path) -> list[Wanted]:
@@ -113,17 +164,15 @@ def main(words: Sequence[str] | None = None) -> int:
     given = parser.parse_args(words)
     console = Console()
     with as_file(files(HOME)) as home:
-        missing = sorted(
-            (row for row in wanted_rows(home, given.out) if row.missing), key=lambda row: row.plan.cost.cpu_s
-        )
-        table = Table("row", "published", "CPU, at most", box=None)
+        missing = sorted((row for row in wanted_rows(home, given.out) if row.missing), key=lambda row: row.cpu_s)
+        table = Table("row", "published", "to train", "CPU, at most", box=None)
         for row in missing:
-            table.add_row(row.name, row.missing, spoken(row.plan.cost.cpu_s))
-        table.add_row("all", "", spoken(sum(row.plan.cost.cpu_s for row in missing)))
+            table.add_row(row.name, row.missing, str(len(row.trainings.seeds)), spoken(row.cpu_s))
+        table.add_row("all", "", "", spoken(sum(row.cpu_s for row in missing)))
         console.print(table)
         failed, left = 0, 3600 * given.hours
         for row in missing if not given.list else ():
-            left -= row.plan.cost.cpu_s
+            left -= row.cpu_s
             if left < 0:
                 console.print(f"{row.name} does not fit in the hours that are left")
                 break

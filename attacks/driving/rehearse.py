@@ -13,7 +13,6 @@ from torch import Tensor
 from cavbench.core.contracts import Access
 from cavbench.core.ranges import Count, NotNegative, Positive
 from cavbench.driving import DrivingAttack, Oracle, State
-from cavbench.driving.threat import project
 
 SIGNS = torch.tensor(list(product((1.0, -1.0), repeat=3)))
 """[8, 3] the lies, of the cars in the ego's lane, on its left and on its right: 1 is nearer and closing, -1 the opposite."""
@@ -108,11 +107,10 @@ def shown(observation: Tensor, signs: Tensor, oracle: Oracle) -> Tensor:
     ahead, side = place[..., 1:, x - 1], place[..., 1:, y - 1] - SOON_S * place[..., :1, vy - 1]
     role = torch.where(side.abs() < HALF_LANE, 0, torch.where(side < 0, 1, 2))
     sign = signs.gather(-1, role)
-    # A car level with the ego counts as ahead.
-    along, across = -sign * torch.where(ahead < 0, -1.0, 1.0), -sign * side.sign()
     shift = torch.zeros_like(observation)
-    shift[..., 1:, x] = shift[..., 1:, vx] = along
-    shift[..., 1:, y] = shift[..., 1:, vy] = across
+    # A car level with the ego counts as ahead.
+    shift[..., 1:, x] = shift[..., 1:, vx] = torch.where(ahead < 0, sign, -sign)
+    shift[..., 1:, y] = shift[..., 1:, vy] = -sign * side.sign()
     shift[..., 0, y] = 1.0
-    radius = oracle.threat.radius(observation, features)
-    return project(observation + shift * radius, observation, radius)
+    # Each value is at an end of the set, or as it is: only the sensor's range limits it further.
+    return (observation + shift * oracle.threat.radius(observation, features)).clamp(-1, 1)

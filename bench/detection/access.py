@@ -17,8 +17,10 @@ from torch import Tensor
 
 from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.detection.detector import STOP_SIGN, Detector, Predictions, label_of
+from cavbench.detection.half import Precision, computing_in, in_full
 from cavbench.detection.reports import Reports
 from cavbench.detection.threat import PatchThreat
+from cavbench.isolation.modes import Modes
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import TamperError, Watch
 
@@ -73,13 +75,19 @@ class PatchOracle:
             # The detector gets a copy: one that writes to its input would change the attack's images.
             return detector(pictures.clone())
 
-    def differentiable(self, pictures: Tensor) -> Predictions:
-        """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`."""
-        with self._enforcer.asked("gradients", len(pictures)) as detector:
+    def differentiable(self, pictures: Tensor, precision: Precision = "float32") -> Predictions:
+        """The detector's predictions on images [N, 3, H, W], with the graph back to the pixels; needs access `gradients`.
+
+        Args:
+            pictures: the images.
+            precision: of the convolutions and products of matrices; patches are scored in float32 always.
+        """
+        with self._enforcer.asked("gradients", len(pictures)) as detector, computing_in(precision, detector):
             asked = pictures.clone()
             if asked.requires_grad:
                 asked.register_hook(self._enforcer.cleaned)
-            return detector(asked)
+            found = detector(asked)
+        return found if precision == "float32" else in_full(found)
 
     def aggregate(self, scores: Tensor) -> Tensor:
         """[..., F] what the detector reports of a sign with the scores [..., F] in the frames of an approach, in driving order.
@@ -132,7 +140,7 @@ class PatchEnforcer:
     ) -> None:
         self.detector, self.access = detector, access
         self.threat = deepcopy(threat)
-        self.watch, self.stream = watch, stream
+        self.watch, self.stream, self._modes = watch, stream, Modes()
         self.spent = self.backwards = self.zeros = self.nans = self._evaluated = 0
         self.reports = reports or Reports(self.threat)
         self.oracle = PatchOracle(
@@ -151,13 +159,16 @@ class PatchEnforcer:
         """Let the attack craft: with its own random numbers, and with an eye on the detector.
 
         Raises:
-            TamperError: if it reached the detector past the oracle, or changed the counts.
+            TamperError: if it reached the detector past the oracle, changed the counts, or left a mode of torch on.
         """
+        differentiates = torch.is_grad_enabled()
         self._switch(True)
         try:
             yield
         finally:
             self._switch(False)
+            torch.set_grad_enabled(differentiates)
+        self._modes.settle("attack")
         if self.spent != self._evaluated:
             raise TamperError("the attack changed the count of its queries", "attack")
         if self.watch and self.watch.strays:
@@ -183,7 +194,9 @@ class PatchEnforcer:
         if away:
             self._switch(False)
         try:
-            yield self.detector
+            with self._modes.for_victim():
+                yield self.detector
+                self._modes.settle("defense")
         finally:
             if away:
                 self._switch(True)

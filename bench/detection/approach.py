@@ -22,6 +22,7 @@ from cavbench.detection.patch import Patch
 from cavbench.detection.printing import non_printability
 from cavbench.detection.scenes import Approach, Scenes
 from cavbench.detection.sight import SAME_IOU, Sight, certain, look, look_at_decoys, look_at_faces
+from cavbench.isolation.modes import kept
 from cavbench.isolation.streams import put_back
 
 Columns = dict[str, NDArray[np.generic]]
@@ -233,7 +234,7 @@ def probed(
         return torch.full_like(image, 0.5).repeat(size, 1, 1, 1).index_copy(0, torch.tensor([at]), image), at
 
     def ask(pictures: Tensor, at: int = 0, gradients: bool = False) -> float:
-        with torch.set_grad_enabled(gradients):
+        with torch.set_grad_enabled(gradients), kept("defense"):
             output = detector(pictures.clone().requires_grad_(gradients))
         boxes = box.to(output.boxes).expand(len(pictures), 4)
         return float(confidence(output, label, boxes, iou=SAME_IOU)[at].detach())
@@ -259,7 +260,8 @@ def probed(
 
 def misled(detector: Detector, sight: Sight) -> bool:
     """Whether what attacks optimise, `Detector.aggregate` of the frames' scores, is not what was reported."""
-    optimised = detector.aggregate(torch.from_numpy(sight.by_frame.copy()))
+    with kept("defense"):
+        optimised = detector.aggregate(torch.from_numpy(sight.by_frame.copy()))
     return not abs(float(optimised.mean()) - float(sight.confidence.mean())) <= SAME_MEAN
 
 

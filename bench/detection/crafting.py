@@ -20,6 +20,7 @@ from cavbench.detection.scenes import Scenes
 from cavbench.detection.threat import PatchThreat
 from cavbench.errors import UserError
 from cavbench.isolation.kept import unchanged
+from cavbench.isolation.modes import kept
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Watch
 
@@ -86,7 +87,8 @@ def prepare(job: Job, made_by: str, progress: Progress) -> bytes:
     assert isinstance(threat, PatchThreat)
     with Stream("load", job.attack_seed).in_use():
         sites = joined.sites(world, threat, job.cell, job.seeds) or [world.training_scenes()]
-        detector = placed(pair.load(job.training_seed), job.device)
+        with kept("defense"):
+            detector = placed(pair.load(job.training_seed), job.device)
 
         def one(number: int) -> Patch:
             def tell(share: float, text: str) -> None:

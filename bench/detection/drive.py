@@ -34,6 +34,7 @@ from cavbench.detection.patch import Patch, read_all
 from cavbench.detection.placed import placed
 from cavbench.detection.scenes import Approach
 from cavbench.errors import UserError
+from cavbench.isolation.modes import kept
 from cavbench.isolation.seal import Seal
 from cavbench.isolation.streams import Stream
 from cavbench.isolation.watch import Watch
@@ -93,7 +94,7 @@ def _carried_out(jobs: Sequence[Job], artefacts: Mapping[str, bytes], traced: Se
     assert isinstance(world, CameraWorld)
     patches = [_patches(artefacts[job.artefact], job) if job.artefact in artefacts else [None] for job in jobs]
     SEAL.check()
-    with Stream("load", first.attack_seed).in_use():
+    with Stream("load", first.attack_seed).in_use(), kept("defense"):
         # Before any code of the defence runs, which could change what these are made from.
         approaches = world.approaches(first.cell, first.seeds)
         check_approaches(approaches, first.seeds, type(world).__name__)

@@ -16,6 +16,7 @@ from cavbench.detection.boxes import best_other, confidence, detections
 from cavbench.detection.detector import STOP_SIGN, Detections, Detector, Predictions
 from cavbench.detection.scenes import Scenes
 from cavbench.errors import UserError
+from cavbench.isolation.modes import kept
 
 BATCH = 16
 """Frames per forward pass."""
@@ -105,7 +106,9 @@ def certain(detector: Detector, scenes: Scenes, share: float) -> NDArray[np.floa
         return None  # No frame is rendered for a detector without a certificate.
     reach, parts = scenes.reach(share), []
     for frames in torch.arange(len(scenes)).split(BATCH):
-        part = detector.certified(scenes.render(frames, None, share), scenes.boxes[frames], reach[frames])
+        shown = scenes.render(frames, None, share)
+        with kept("defense"):
+            part = detector.certified(shown, scenes.boxes[frames], reach[frames])
         if part is None:
             return None
         parts.append(part.numpy())
@@ -140,8 +143,9 @@ def glance(detector: Detector, pictures: Tensor, boxes: Tensor, moved_m: Tensor,
         UserError: if a prediction is NaN, infinite or complex.
     """
     label = detector.index(STOP_SIGN)
-    alone = _finite(detector(pictures), detector)
-    predictions, state = detector.advance(alone, moved_m, state)
+    with kept("defense"):
+        alone = _finite(detector(pictures), detector)
+        predictions, state = detector.advance(alone, moved_m, state)
     if predictions is not alone:
         _finite(predictions, detector)
     boxes = boxes.to(predictions.boxes)

@@ -134,7 +134,9 @@ class Oracle:
 
     def decide(self, observation: Tensor) -> Tensor:
         """The victim's actions, int64 [..., B] or float [..., B, 2]; needs access `decisions`."""
-        actions = self._enforcer.subject.policy.choose(self._answered("decisions", observation))
+        scores = self._answered("decisions", observation)
+        with self._enforcer.subject.asked():
+            actions = self._enforcer.subject.choose(scores)
         if self.draws == 1:
             return actions
         return actions.mean(0) if actions.is_floating_point() else actions.mode(0).values
@@ -225,7 +227,7 @@ class Oracle:
         if state is not None and len(state) != len(flat):
             raise UserError(f"the attack rehearsed {len(flat)} episodes with the state of {len(state)}")
         with subject.asked(), torch.no_grad():
-            action = subject.policy.choose(subject.answered(flat, state, self._numbers(observation)))
+            action = subject.choose(subject.answered(flat, state, self._numbers(observation)))
             after = subject.advance(flat, action, state)
         return action.unflatten(0, observation.shape[:-2]).clone(), after
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cavbench.driving.policy import Policy, State
+from cavbench.isolation.modes import kept
 
 
 class Alarms:
@@ -33,7 +34,8 @@ class Alarms:
             running: bool [B], the episodes that were running.
             touched: bool [B], those whose observation was falsified.
         """
-        found = self.policy.suspicion(shown, state)
+        with kept("defense"):
+            found = self.policy.suspicion(shown, state)
         if found is None:
             self.level += np.nan
             return

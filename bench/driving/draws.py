@@ -18,8 +18,9 @@ from torch import Tensor
 
 from cavbench.driving import draw_kernels
 
-CALL, LARGEST = 0xD1342543DE82EF95, 2**64 - 1
-"""What is added to the numbers for each further call of `noise` in an answer (the multiplier of Steele and Vigna 2022)."""
+CALL, POINT, LARGEST = 0xD1342543DE82EF95, 0xAF251AF3B0F025B5, 2**64 - 1
+"""What is added to the numbers for each further call of `noise` in an answer, and for each further point at which a filter asks
+about an observation (multipliers of Steele and Vigna 2022)."""
 
 
 @dataclass(eq=False)
@@ -74,17 +75,28 @@ def given(numbers: Tensor | None) -> Iterator[Given | None]:
 def noise(like: Tensor) -> Tensor:
     """Standard normal noise for the measured values of observations `like` [..., V, F]: [..., V, F - 1].
 
-    It is a function of the numbers that the run gave these observations, and of how often this answer has drawn before. Without a
+    It is a function of the numbers that the run gave these observations, and of how often this answer has drawn before. A filter
+    may ask at several points about each observation: they stand in front, [P, N, V, F], and each has noise of its own. Without a
     number for each observation, torch's generator draws.
     """
     found, leading, size = _GIVEN.get(), like.shape[:-2], like.shape[-2:]
     wanted = size[0] * (size[1] - 1)
-    if found is None or len(found.numbers) != leading.numel():
+    points = None if found is None else _points(leading, len(found.numbers))
+    if found is None or points is None:
         return torch.randn_like(like[..., 1:])
     numbers = found.numbers.numpy().view(np.uint64)
     if found.calls:
         numbers = numbers + np.uint64(found.calls * CALL & LARGEST)
+    if points > 1:
+        numbers = (np.arange(points, dtype=np.uint64)[:, None] * np.uint64(POINT) + numbers).reshape(-1)
     found.calls += 1
     values = np.empty((len(numbers), wanted + wanted % 2), np.float32)
     draw_kernels.normal(numbers, values)
     return torch.from_numpy(values)[:, :wanted].reshape(*leading, size[0], size[1] - 1).to(like)
+
+
+def _points(leading: torch.Size, numbers: int) -> int | None:
+    """How many points stand in front of the observations that have the numbers; None if these are other observations."""
+    return next(
+        (leading[:place].numel() for place in range(len(leading) + 1) if leading[place:].numel() == numbers), None
+    )

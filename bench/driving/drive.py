@@ -39,6 +39,7 @@ from cavbench.driving.policy import Policy
 from cavbench.driving.rollout import Trace, rollout
 from cavbench.driving.threat import ObservationThreat
 from cavbench.errors import UserError
+from cavbench.isolation.modes import kept
 from cavbench.isolation.seal import Seal
 from cavbench.isolation.streams import Stream
 
@@ -123,7 +124,11 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
         env = world.build(cells, control)
         try:
             dynamics = world.dynamics(cells, declared.action_type)
-            policy, attack = _checked(pair.load(first.training_seed, first.cell), pair), pair.armed(first.training_seed)
+            with kept("defense", "attack"):
+                policy, attack = (
+                    _checked(pair.load(first.training_seed, first.cell), pair),
+                    pair.armed(first.training_seed),
+                )
             policy = placed(policy, first.device)
             columns = rollout(
                 env,

@@ -99,6 +99,12 @@ class Features:
         """[F - 1] ends of the ranges. Every copy of the features has tensors of its own: nobody writes to those of another."""
         return torch.tensor(self.low), torch.tensor(self.high)
 
+    @cached_property
+    def _scale(self) -> tuple[Tensor, Tensor]:
+        """[F - 1] middles of the ranges, and half their sizes."""
+        low, high = self._ends
+        return (high + low) / 2, (high - low) / 2
+
     def forgeable(self) -> Tensor:
         """[F - 1] 1 for the features that an attack may change, 0 for those that are `fixed`."""
         return torch.tensor([float(name not in self.fixed) for name in self.names])
@@ -115,13 +121,12 @@ class Features:
 
     def half_range(self) -> Tensor:
         """[F - 1] size of one normalised unit, in physical units."""
-        low, high = self._ends
-        return (high - low) / 2
+        return self._scale[1].clone()
 
     def physical(self, observation: Tensor) -> Tensor:
         """[..., V, F - 1] the measured values of an observation [..., V, F], in physical units."""
-        low, high = (end.to(observation) for end in self._ends)
-        return (high + low) / 2 + observation[..., 1:] * (high - low) / 2
+        centre, half = (one.to(observation) for one in self._scale)
+        return centre + observation[..., 1:] * half
 
     def normalised(self, physical: Tensor) -> Tensor:
         """[..., F - 1] values in physical units on the scale of observations: -1 and 1 are the ends of a range, not clipped."""

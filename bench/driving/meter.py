@@ -18,6 +18,7 @@ from cavbench.driving.metrics import safe_progress
 from cavbench.driving.policy import State, rows_of
 from cavbench.driving.strings import Strings
 from cavbench.driving.victim import CountedPolicy
+from cavbench.isolation.modes import kept
 
 CHANGED = 0.1
 """A continuous action counts as changed if it differs by more than this on its [-1, 1] scale."""
@@ -98,7 +99,8 @@ class Meter:
         self.offroad |= info["offroad"] & running
         np.copyto(self.end_x, info["x"], where=running)
         self.strings.step(info, running)
-        assured = self.subject.policy.assured(shown.observation, state)
+        with kept("defense"):
+            assured = self.subject.policy.assured(shown.observation, state)
         self.assured += np.nan if assured is None else np.where(running, assured.numpy(), 0.0)
         self.watched.step(shown.observation, state, running, running & (linf > 0))
         self.gradients += shown.gradients.numpy()

@@ -142,7 +142,7 @@ class Shadow:
     def _advanced(self, moment: _Moment, scores: Tensor, state: State) -> State:
         """The copies' state after a step: each took what was answered, those that are shown what was driven what was driven."""
         with self.subject.as_asked():
-            action = self.subject.policy.choose(scores).clone()
+            action = self.subject.choose(scores).clone()
             action[self._own] = moment.action[self.rows]
             return self.subject.advance(moment.points, action, state)
 

@@ -12,6 +12,7 @@ from cavbench.driving.draws import Draws, fresh, given
 from cavbench.driving.policy import Policy, State
 from cavbench.driving.threat import finite
 from cavbench.errors import UserError
+from cavbench.isolation.modes import Modes
 from cavbench.isolation.streams import Stream, put_back
 from cavbench.isolation.watch import Side, TamperError, Watch
 
@@ -51,7 +52,7 @@ class CountedPolicy:
         self.action_type = policy.action_type
         self.evaluations = 0
         self.draws = self.shares = False
-        self._foreign = False
+        self._foreign, self._modes = False, Modes()
 
     def numbers(self, rows: Tensor | None = None, copies: int = 1) -> Tensor | None:
         """Numbers for the draws of a call, as of `Draws.numbers`; None if the run has none."""
@@ -60,14 +61,14 @@ class CountedPolicy:
     @contextmanager
     def turn(self) -> Iterator[None]:
         """Run an attack: with its own random numbers, and with an eye on evaluations that it does not ask the oracle for."""
-        settings = torch.is_grad_enabled(), torch.get_default_dtype()
+        differentiates = torch.is_grad_enabled()
         self._switch(True, self.stream)
         try:
             yield
         finally:
             self._switch(False, self.stream)
-            torch.set_grad_enabled(settings[0])
-            torch.set_default_dtype(settings[1])
+            torch.set_grad_enabled(differentiates)
+        self._modes.settle("attack")
 
     @contextmanager
     def asked(self, foreign: bool = False) -> Iterator[None]:
@@ -82,7 +83,8 @@ class CountedPolicy:
             return
         self._switch(foreign, self.stream if self.shares else None)
         try:
-            yield
+            with self._modes.for_attack() if foreign else self._modes.for_victim():
+                yield
         finally:
             self._switch(before, self.stream if self.shares else None)
 
@@ -113,12 +115,21 @@ class CountedPolicy:
 
     def initial(self, episodes: Tensor) -> State:
         """The policy's state before the first step; `episodes` are opaque numbers."""
-        return self.policy.initial(episodes)
+        state = self.policy.initial(episodes)
+        self._modes.settle("defense")
+        return state
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         """The policy's state after a step, as a copy that nobody else has."""
         after = self.policy.advance(plain(observation), action.clone(), state)
+        self._modes.settle("defense")
         return None if after is None else after.clone()
+
+    def choose(self, scores: Tensor) -> Tensor:
+        """The actions [B] (or [B, 2]) for scores of the policy."""
+        action = self.policy.choose(scores)
+        self._modes.settle("defense")
+        return action
 
     def aside(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
         """The scores [B, A], as in `noticed`, and what is drawn is put back."""
@@ -148,11 +159,11 @@ class CountedPolicy:
             UserError: if the scores are NaN, infinite or complex.
         """
         scores = self._scores(plain(observation), state, "while driving", numbers)
-        return scores, self.policy.choose(scores)
+        return scores, self.choose(scores)
 
     def decided(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
         """The actions [B] for observations [B, V, F], as in `driven`."""
-        return self.policy.choose(self._scores(plain(observation), state, numbers=numbers))
+        return self.choose(self._scores(plain(observation), state, numbers=numbers))
 
     @torch.no_grad()
     def answered(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
@@ -189,6 +200,7 @@ class CountedPolicy:
         gradient = None
         if outer is not None and scores.requires_grad:
             (gradient,) = torch.autograd.grad(scores, asked, outer, allow_unused=True)
+            self._modes.settle("defense")
         return value.detach(), torch.zeros_like(asked).detach() if gradient is None else gradient
 
     def valued(
@@ -199,12 +211,15 @@ class CountedPolicy:
         asked = action.detach().clone()
         if not asked.is_floating_point():
             with given(numbers):
-                return self.policy.value(observation.clone(), asked, state).detach(), None
+                value = self.policy.value(observation.clone(), asked, state).detach()
+            self._modes.settle("defense")
+            return value, None
         asked.requires_grad_(True)
         with torch.enable_grad():
             with given(numbers):
                 value = self.policy.value(observation.clone(), asked, state)
             found = torch.autograd.grad(value.sum(), asked, allow_unused=True) if value.requires_grad else (None,)
+        self._modes.settle("defense")
         return value.detach(), torch.zeros_like(asked).detach() if found[0] is None else found[0]
 
     def _scores(
@@ -218,6 +233,7 @@ class CountedPolicy:
         self.evaluations += len(observation)
         with given(numbers) as found:
             scores = self.policy.scores(observation, state)
+        self._modes.settle("defense")
         if found is not None and found.calls:
             self.draws = True
         if type(scores) is not Tensor:

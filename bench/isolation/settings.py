@@ -40,6 +40,7 @@ BACKENDS = (
 )
 """Flags of torch's backends that change numbers, by their modules in `torch.backends`."""
 NUMPY = {"divide": "warn", "over": "warn", "under": "ignore", "invalid": "warn"}
+AUTOCAST = "cpu", "cuda"
 
 
 class Settings:
@@ -132,6 +133,11 @@ def _backend(where: str) -> Any:
 def _put_backends(before: Mapping[tuple[str, str], bool]) -> None:
     for (where, name), value in before.items():
         setattr(_backend(where), name, value)
+
+
+def _put_autocast(before: Sequence[bool]) -> None:
+    for device, enabled in zip(AUTOCAST, before, strict=True):
+        _torch().set_autocast_enabled(device, enabled)
 
 
 def _put_collector(before: tuple[bool, tuple[int, int, int], int]) -> None:
@@ -314,6 +320,13 @@ SETTINGS = (
         read=lambda: bool(_torch().nn.modules.module._has_any_global_hook()),
         module="torch",
         usual=False,
+    ),
+    Setting(
+        name="the automatic types of torch",
+        read=lambda: [_torch().is_autocast_enabled(device) for device in AUTOCAST],
+        write=_put_autocast,
+        module="torch",
+        usual=[False] * len(AUTOCAST),
     ),
     Setting(
         name="the anomaly mode of torch",

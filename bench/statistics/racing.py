@@ -27,7 +27,9 @@ def kept(scores: Array) -> list[int]:
 
 
 def by_the_rule(scores: Array, went_on: list[int]) -> bool:
-    """Whether the attacks that went on are those of a race: at least `KEPT`, and no other one was stronger in the pilot.
+    """Whether all attacks went on that a race keeps: no other one was as strong in the pilot as the strongest `KEPT` of these.
+
+    Weaker ones may have gone on, too: they can only lower the score.
 
     Args:
         scores: [A, R, C, E] of all attacks in the pilot.
@@ -35,7 +37,9 @@ def by_the_rule(scores: Array, went_on: list[int]) -> bool:
     """
     means = scores.mean((1, 2, 3))
     others = [place for place in range(len(scores)) if place not in went_on]
-    return len(went_on) >= KEPT and (not others or bool(means[went_on].max() < means[others].min() - TIE))
+    if len(went_on) < KEPT:
+        return False
+    return not others or bool(np.sort(means[went_on])[KEPT - 1] < means[others].min() - TIE)
 
 
 def hidden(scores: Array) -> float:

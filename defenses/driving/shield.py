@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cavbench.core.ranges import NotNegative
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, State
-from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.boxes import Assumed, Boxes
 from cavbench.driving.intervals.corridor import Corridor, CorridorJudge
 from cavbench.driving.intervals.ego import Ego, Step
 from cavbench.driving.intervals.margins import Judge, Margins
@@ -20,6 +20,7 @@ from cavbench.driving.intervals.mask import Mask
 from cavbench.driving.intervals.policy import IntervalPolicy, remembers, with_inner
 from cavbench.driving.intervals.rooms import Caution, cars_of
 from cavbench.driving.threat import Norm
+from cavbench.driving.victims.networks import compiled
 from cavbench.errors import UserError
 
 SOFTNESS = 2.0
@@ -110,6 +111,14 @@ class Shielded(Filter):
         super().__init__(settings, policy, facts)
         self.judge = Judge(self.reckoning, self.period, self.caution)
         self.mask = Mask(self.judge, self.assumed, self.band, SOFTNESS)
+
+    def answered(self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, state: State) -> Tensor:
+        assert state is not None
+        network = compiled(self.policy, observation)
+        # What weighs otherwise is no mask in front of a network.
+        if network is None or type(self).weighed is not Shielded.weighed or not self.mask.fits(observation, state):
+            return super().answered(observation, assumed, tracks, state)
+        return self.mask.scores(observation, assumed, tracks, state["ego"], network)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None

@@ -57,10 +57,12 @@ class Tracked(PolicyWrapper):
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         assert state is not None
-        boxes, inner = self.boxes(observation, state), state.get("inner", None)
-        if isinstance(self.policy, IntervalPolicy):
-            return self.policy.weighed(observation, boxes, inner)
-        return self.policy.scores(self._estimate(observation, boxes, state), inner)
+        inner = state.get("inner", None)
+        if not isinstance(self.policy, IntervalPolicy):
+            return self.policy.scores(self._estimate(observation, self.boxes(observation, state), state), inner)
+        if type(self).boxes is not Tracked.boxes:
+            return self.policy.weighed(observation, self.boxes(observation, state), inner)
+        return self.policy.answered(observation, self.assumed, state.get("tracks", None), inner)
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None

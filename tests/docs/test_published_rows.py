@@ -15,7 +15,7 @@ from tests.tree import ROOT
 README = {
     "driver `dqn`": ("dqn", "none"),
     "`dqn`, adversarially trained": ("dqn", "advtrain"),
-    "`dqn`, trained behind a tracker and a shield; two attacks": ("dqn", "tracker+shield"),
+    "`dqn`, trained behind a tracker and a shield": ("dqn", "tracker+shield"),
     "`planner`: rules instead of a network": ("planner", "none"),
     "detector `yolov5`": ("yolov5", "none"),
     "`yolov3_tiny`, adversarially trained": ("yolov3_tiny", "advtrain_detection"),

@@ -100,11 +100,26 @@ def test_noise_has_the_same_bits_in_every_batch_and_place() -> None:
         assert noise(torch.zeros(1, 3, 2)).shape == (1, 3, 1)
 
 
+def test_each_point_of_a_filter_has_noise_of_its_own_in_every_batch() -> None:
+    seen, numbers = observations(40, 0), Draws(torch.arange(40)).numbers()
+    points = seen.expand(16, *seen.shape)
+    with given(numbers):
+        whole = noise(points)
+    assert len(whole.flatten(2).flatten(0, 1)[:, 0].unique()) == 16 * 40
+    with given(numbers):
+        assert torch.equal(whole[0], noise(seen))
+    for rows in (torch.tensor([7]), torch.arange(3, 20)):
+        with given(numbers[rows]):
+            assert torch.equal(noise(points[:, rows]), whole[:, rows])
+    between = whole.flatten(1).double() @ whole.flatten(1).double().T / whole[0].numel() - torch.eye(16)
+    assert float(between.abs().max()) < 6 * math.sqrt(2 / whole[0].numel())
+
+
 def test_without_a_number_for_each_observation_the_process_draws() -> None:
     seen = torch.zeros(4, 10, 5)
     torch.manual_seed(0)
     usual = torch.randn_like(seen[..., 1:])
-    for numbers in (None, torch.arange(3)):
+    for numbers in (None, torch.arange(3), torch.arange(40)):
         torch.manual_seed(0)
         with given(numbers):
             assert torch.equal(noise(seen), usual)

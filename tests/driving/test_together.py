@@ -21,6 +21,7 @@ from cavbench.attacks.driving.zo import ZOSignSGD
 from cavbench.core.contracts import Access
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Columns
+from cavbench.defenses.driving.pessimist_q import Believing, PessimistQ
 from cavbench.defenses.driving.smoothing import Smoothed
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
 from cavbench.driving.access import DRAWS
@@ -121,11 +122,17 @@ def test_units_in_one_batch_have_the_records_that_each_has_alone(name: str, kind
         np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), column)
 
 
-@pytest.mark.parametrize("name", ["none", "pgd", "plan", "zo", "rehearse"])
-def test_units_of_a_smoothed_victim_in_one_batch_have_the_records_that_each_has_alone(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "defense"),
+    [*((name, None) for name in ("none", "pgd", "plan", "zo", "rehearse")), ("pgd", PessimistQ(corners=3))],
+)
+def test_units_of_a_smoothed_victim_in_one_batch_have_the_records_that_each_has_alone(
+    name: str, defense: PessimistQ | None
+) -> None:
     """Its noise belongs to the episode: not to the batch, nor to how many others there are."""
     torch.manual_seed(0)
-    policy = Smoothed(QPolicy(5, 5, 32).eval().requires_grad_(False), 0.05)
+    policy: Policy = Smoothed(QPolicy(5, 5, 32).eval().requires_grad_(False), 0.05)
+    policy = policy if defense is None else Believing(defense, policy, HIGHWAY.facts)
     attack = {**ATTACKS, "plan": Plan(steps=2), "pgd": PGD(steps=2), "rehearse": Rehearse(horizon=1.0)}[name]
     together = driven(attack, policy, (0, 1, 2), share=0.7)
     alone = [driven(attack, policy, (unit,), share=0.7) for unit in range(3)]

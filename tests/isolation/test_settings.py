@@ -44,6 +44,7 @@ PUT_BACK = {
     "import torch; torch.set_default_dtype(torch.float64)": "the default type of torch",
     "import torch; torch.set_default_device('meta')": "the default device of torch",
     "import torch; torch.set_grad_enabled(False)": "the gradient mode of torch",
+    "import torch; torch.set_autocast_enabled('cpu', True)": "the automatic types of torch",
     "import torch; torch.autograd.set_detect_anomaly(True)": "the anomaly mode of torch",
     "import torch; torch.use_deterministic_algorithms(True)": "the deterministic mode of torch",
     "import torch; torch.set_float32_matmul_precision('medium')": "the precision of torch",

@@ -36,6 +36,9 @@ def test_records_follow_the_rule_only_if_the_strongest_went_on() -> None:
     first, second, *others = np.argsort(scores.mean((1, 2, 3))).tolist()
     assert by_the_rule(scores, [first, second])
     assert by_the_rule(scores, [second, others[0], first])
+    assert by_the_rule(scores, [first, second, others[-1]]), (
+        "a weaker one that has all scenarios can only lower the score"
+    )
     assert not by_the_rule(scores, [first])
     assert not by_the_rule(scores, [first, others[0]])
     assert not by_the_rule(scores, [second, others[0], others[1]])

@@ -11,6 +11,7 @@ from torch.nn import functional
 
 from cavbench.detection.boxes import overlap
 from cavbench.detection.victims.examples import Example
+from cavbench.errors import UserError
 
 CLASS, CORNERS, SHAPE = 2.0, 5.0, 2.0
 """Weights of the three parts of the cost of a match; the last two are those of the loss (Zhu et al. 2021, section A.4)."""
@@ -69,12 +70,19 @@ def matched(
         labels: int64 [T] true labels.
         side: of the image, in pixels.
         copies: number of queries for each object.
+
+    Raises:
+        UserError: if the costs are not finite: the training has diverged.
     """
     sure = logits.sigmoid()[:, labels]
     right = ALPHA * (1 - sure) ** GAMMA * -sure.clamp(min=SMALLEST).log()
     wrong = (1 - ALPHA) * sure**GAMMA * -(1 - sure).clamp(min=SMALLEST).log()
     place, true = here.unsqueeze(1), boxes.unsqueeze(0)
     cost = CLASS * (right - wrong) + CORNERS * distance(place, true) / side - SHAPE * likeness(place, true)
+    if not bool(cost.isfinite().all()):
+        raise UserError(
+            "the detector's boxes or classes are not finite, so its training has diverged: try a lower learning rate"
+        )
     queries, objects = linear_sum_assignment(cost.repeat(1, copies).numpy())
     return torch.from_numpy(queries), torch.from_numpy(objects) % max(len(boxes), 1)
 

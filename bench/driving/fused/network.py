@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterator, Sequence
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
@@ -30,26 +31,41 @@ class Fused:
 
     Its answers are those of torch to about 1e-6, and the same to the last bit in every batch. It reads the weights anew in
     every call. It answers only where nothing else can be wanted of the network than its output and the gradient in its input
-    (`fits`): torch trains, exports and runs hooks.
+    (`fits`): torch trains, exports, runs hooks, and computes whatever was changed in the network since it was built.
 
     Args:
+        network: the network, with all that it is made of.
         layers: linear layers with bias, each with what follows it: `ReLU`, `Tanh` or nothing.
         encoder: its layers `car`, `ego` and `pair`; None for a network that reads all values of an observation.
         dueling: whether the outputs are a state value and advantages.
         scale: factors of the outputs [A]; None for 1.
     """
 
-    marked: ClassVar[tuple[str, ...]] = ("modules", "scale", "widths", "kinds", "last", "outputs", "features", "size")
+    marked: ClassVar[tuple[str, ...]] = (
+        "modules",
+        "scale",
+        "widths",
+        "kinds",
+        "last",
+        "outputs",
+        "features",
+        "size",
+        "built",
+    )
     """What the watch compares (`cavbench.isolation.watch.marks`)."""
 
     def __init__(
         self,
+        network: nn.Module,
         layers: Sequence[tuple[nn.Linear, type[nn.Module] | None]],
         *,
         encoder: tuple[nn.Linear, nn.Linear, nn.Linear] | None = None,
         dueling: bool = False,
         scale: Tensor | None = None,
     ) -> None:
+        self.built = tuple(
+            (one, type(one), tuple(one._modules.values()), tuple(one._buffers.values())) for one in network.modules()
+        )
         linears, kinds = zip(*layers, strict=True)
         self.modules: tuple[nn.Linear, ...] = (*(encoder or ()), *linears)
         self.scale = scale
@@ -76,9 +92,19 @@ class Fused:
         shape = observation.shape
         if shape[-1] != self.size or (self.width and shape[-2] < 2) or torch._C._are_functorch_transforms_active():
             return False
-        for module in self.modules:
-            # Hooks count who evaluates the network past the oracle.
-            if module._forward_pre_hooks or module._forward_hooks or module._backward_hooks:
+        for module, kind, children, buffers in self.built:
+            own = module.__dict__
+            # Hooks count who evaluates the network past the oracle, or are of a defence.
+            if (
+                own["_forward_pre_hooks"]
+                or own["_forward_hooks"]
+                or own["_backward_hooks"]
+                or own["_backward_pre_hooks"]
+            ):
+                return False
+            if type(module) is not kind or "forward" in own or tuple(own["_modules"].values()) != children:
+                return False
+            if own["_buffers"] and not all(map(operator.is_, own["_buffers"].values(), buffers)):
                 return False
         weights = self._weights()
         if any(weight.requires_grad for weight in weights):
@@ -101,6 +127,10 @@ class Fused:
             return answer
         return self.forward(observation, keeps=False)[0]
 
+    def keeps(self, observation: Tensor) -> bool:
+        """Whether a pass whose gradient may be asked for keeps what that needs."""
+        return observation.shape[: -self.dimensions].numel() <= MANY
+
     def forward(self, observation: Tensor, *, keeps: bool) -> tuple[Tensor, Any]:
         """The answers [..., A], and what the gradient needs besides them (`kernels.forward`)."""
         leading = observation.shape[: -self.dimensions]
@@ -114,6 +144,29 @@ class Fused:
         given = points, weights, self.form(points.shape[1]), self.widths, self.kinds
         kernels.forward(*given, out, kept, best, chosen)
         return torch.from_numpy(out).view(*leading, self.outputs), (*given, kept, best, chosen)
+
+    def backward(self, kept: Any, by_answer: Tensor) -> kernels.Floats:
+        """The gradient in the points [N, n], from that in the answers [..., A] and what `forward` gave besides them."""
+        points = kept[0]
+        by_out = by_answer.detach().reshape(len(points), self.outputs).contiguous().numpy()
+        asked = np.flatnonzero(by_out.any(1))
+        # A second pass forward costs as much as one backward.
+        if len(points) <= len(kept[-1]) * kernels.LANES and 2 * len(asked) > len(points):
+            by_points = np.empty_like(points)
+            kernels.backward(*kept, by_out, by_points)
+            return by_points
+        found = np.zeros_like(points)
+        if len(asked):
+            some = torch.from_numpy(points[asked])
+            again = self.forward(some.view(-1, *self._shape(points.shape[1])), keeps=True)[1]
+            by_points = np.empty_like(again[0])
+            kernels.backward(*again, by_out[asked], by_points)
+            found[asked] = by_points
+        return found
+
+    def _shape(self, size: int) -> tuple[int, ...]:
+        """The shape of an observation of `size` values."""
+        return (size // self.features, self.features) if self.width else (size,)
 
     def gathered(self) -> Tensor:
         """All weights in one vector, in the order of `kernels.forward`; the parameters become views of it."""
@@ -163,7 +216,7 @@ def chain(network: object) -> Fused | None:
             found[-1] = found[-1][0], kind
         else:
             return None
-    return Fused(found) if found else None
+    return Fused(network, found) if found and isinstance(network, nn.Module) else None
 
 
 def _flat(network: object) -> Iterator[Any]:
@@ -179,26 +232,10 @@ class _Pass(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, observation: Tensor, network: Fused) -> Tensor:
         ctx.shape, ctx.network = observation.shape, network
-        ctx.lean = observation.shape[: -network.dimensions].numel() > MANY
-        answer, ctx.kept = network.forward(observation, keeps=not ctx.lean)
+        answer, ctx.kept = network.forward(observation, keeps=network.keeps(observation))
         return answer
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_answer: Tensor) -> tuple[Tensor, None]:
-        points, network = ctx.kept[0], ctx.network
-        by_out = by_answer.detach().reshape(len(points), network.outputs).contiguous()
-        asked = by_out.any(1).nonzero().squeeze(1)
-        # A second pass forward costs as much as one backward.
-        if not ctx.lean and 2 * len(asked) > len(points):
-            by_points = np.empty_like(points)
-            kernels.backward(*ctx.kept, by_out.numpy(), by_points)
-            return torch.from_numpy(by_points).view(ctx.shape), None
-        found = torch.zeros(points.shape)
-        if len(asked):
-            some = torch.from_numpy(points)[asked]
-            kept = network.forward(some.view(-1, *ctx.shape[len(ctx.shape) - network.dimensions :]), keeps=True)[1]
-            by_points = np.empty_like(kept[0])
-            kernels.backward(*kept, by_out[asked].numpy(), by_points)
-            found[asked] = torch.from_numpy(by_points)
-        return found.view(ctx.shape), None
+        return torch.from_numpy(ctx.network.backward(ctx.kept, by_answer)).view(ctx.shape), None

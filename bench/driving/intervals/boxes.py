@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 
 from cavbench.driving.features import Features
 from cavbench.driving.intervals import box_kernels
+from cavbench.driving.intervals.kernels import Floats
 from cavbench.driving.threat import Norm
 
 ALONG = ("x", "vx")
@@ -64,10 +65,26 @@ class Assumed:
                 that fits none stays, and so does a feature whose intersection is empty.
         """
         if shown.requires_grad and torch.is_grad_enabled():
-            low, high = _Boxes.apply(shown, self._set, tracks)
+            low, high = _Boxes.apply(shown, self, tracks)
         else:
-            low, high, _ = _bounds(shown, self._set, tracks, sloped=False)
+            low, high = (shaped(one, shown.shape[:-2], shown) for one in self.bounds(*_flat(shown, tracks))[:2])
         return Boxes(shown[..., 0] > 0, low, high)
+
+    def bounds(self, shown: Floats, tracks: Floats | None, *, sloped: bool = False) -> tuple[Floats, Floats, Floats]:
+        """`boxes` on arrays: the bounds, [N, V, F - 1] each, and how both change with the shown values, if wanted.
+
+        Args:
+            shown: observations [N, V, F].
+            tracks: as in `boxes`, [N, V - 1, 2 F - 1].
+            sloped: whether the slopes are wanted, [2, N, V, F - 1]; otherwise there are none, [2, 0, V, F - 1].
+        """
+        count, rows, size = shown.shape
+        low, high = np.empty((2, count, rows, size - 1), np.float32)
+        slopes = np.empty((2, count if sloped else 0, rows, size - 1), np.float32)
+        box_kernels.boxes(shown, self._set, low, high, slopes)
+        if tracks is not None:
+            box_kernels.narrow(shown, tracks, low, high, slopes)
+        return low, high, slopes
 
     @cached_property
     def _set(self) -> box_kernels.Set:
@@ -87,26 +104,16 @@ class Assumed:
         return self.features.normalised(values).clamp(-1, 1)
 
 
-def _bounds(
-    shown: Tensor, of: box_kernels.Set, tracks: Tensor | None, *, sloped: bool
-) -> tuple[Tensor, Tensor, NDArray[Any]]:
-    """The bounds [..., V, F - 1], and how both change with the shown values, [2, N, V, F - 1], if wanted."""
-    rows, size = shown.shape[-2:]
-    given = flat(shown, 2)
-    low, high = np.empty((2, len(given), rows, size - 1), np.float32)
-    slopes = np.empty((2, len(given) if sloped else 0, rows, size - 1), np.float32)
-    box_kernels.boxes(given, of, low, high, slopes)
-    if tracks is not None:
-        box_kernels.narrow(given, flat(tracks, 2), low, high, slopes)
-    return shaped(low, shown.shape[:-2], shown), shaped(high, shown.shape[:-2], shown), slopes
+def _flat(shown: Tensor, tracks: Tensor | None) -> tuple[Floats, Floats | None]:
+    return flat(shown, 2), None if tracks is None else flat(tracks, 2)
 
 
 class _Boxes(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, shown: Tensor, of: box_kernels.Set, tracks: Tensor | None) -> tuple[Tensor, Tensor]:
-        low, high, slopes = _bounds(shown, of, tracks, sloped=True)
+    def forward(ctx: Any, shown: Tensor, of: Assumed, tracks: Tensor | None) -> tuple[Tensor, Tensor]:
+        low, high, slopes = of.bounds(*_flat(shown, tracks), sloped=True)
         ctx.kept = slopes, shown.shape, shown.new_empty(0)
-        return low, high
+        return shaped(low, shown.shape[:-2], shown), shaped(high, shown.shape[:-2], shown)
 
     @staticmethod
     @once_differentiable

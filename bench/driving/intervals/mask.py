@@ -12,10 +12,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from cavbench.driving.features import Features
-from cavbench.driving.intervals import filter_kernels, judge_kernels, margins
+from cavbench.driving.fused.network import Fused
+from cavbench.driving.intervals import box_kernels, filter_kernels, judge_kernels, margins
 from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.ego import predicted
-from cavbench.driving.intervals.kernels import Floats
+from cavbench.driving.intervals.kernels import Flags, Floats
 
 
 class Weighed(NamedTuple):
@@ -101,7 +102,48 @@ class Mask:
         if torch.is_grad_enabled() and (values.requires_grad or weighed.margins.requires_grad):
             scores: Tensor = _Lower.apply(values, weighed.margins, weighed.hard, self)
             return scores
-        return _lower(values, weighed.margins, weighed.hard, self)[0]
+        return self.lower(values, weighed.margins, weighed.hard)[0]
+
+    def scores(
+        self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, ego: Tensor, network: Fused
+    ) -> Tensor:
+        """The scores [..., A] of observations that it and a network behind it `fit`: boxes, filter and network in one node.
+
+        The same as `__call__` with their boxes, the network, and `lowered`, to the last bit; so is the gradient.
+
+        Args:
+            observation, ego: as in `__call__`.
+            assumed, tracks: what the boxes follow from (`Assumed.boxes`).
+            network: the network of the policy behind.
+        """
+        if torch.is_grad_enabled() and observation.requires_grad:
+            scores: Tensor = _Score.apply(observation, assumed, tracks, ego, self, network)
+            return scores
+        return _score(observation, assumed, tracks, ego, self, network, sloped=False)[0]
+
+    def weigh(self, shown: Floats, present: Flags, ego: Tensor, low: Floats, high: Floats) -> tuple[Any, ...]:
+        """The fields of `Weighed` for N observations and their boxes, and what `weigh_backward` needs, on arrays."""
+        rooms, given = self.judge.rooms, (shown, present, *predicted(ego), low, high)
+        return filter_kernels.weigh(*given, *self.tables, rooms.asked, rooms.rules, self.facts, np.float32(self.band))
+
+    def weigh_backward(self, by_seen: Floats, by_margins: Floats, kept: judge_kernels.Kept) -> tuple[Floats, ...]:
+        """The gradients in the observations [N, V, F] and in both bounds of their boxes, [N, V, F - 1] each."""
+        given = by_seen, by_margins, *self.tables, self.judge.rooms.rules, self.facts, kept
+        found: tuple[Floats, ...] = filter_kernels.weigh_backward(*given)
+        return found
+
+    def lower(self, values: Tensor, margins: Tensor, hard: Tensor) -> tuple[Tensor, tuple[Floats, Floats]]:
+        """The lowered scores, and what `lower_backward` needs."""
+        given, soft = flat(values, 1), flat(margins.detach().div(self.softness).sigmoid(), 1)
+        out, spread = np.empty_like(given), np.empty(len(given), np.float32)
+        filter_kernels.masked(given, flat(hard, 1), soft, self.order, out, spread)
+        return torch.from_numpy(out).view(values.shape), (soft, spread)
+
+    def lower_backward(self, by_out: Floats, soft: Floats, spread: Floats) -> Floats:
+        """The gradient in the margins, [N, 5]."""
+        by_x = np.empty_like(soft)
+        filter_kernels.masked_backward(by_out, soft, spread, self.order, np.float32(self.softness), by_x)
+        return by_x
 
     @cached_property
     def facts(self) -> judge_kernels.Facts:
@@ -122,21 +164,26 @@ class Mask:
 
 def _weigh(observation: Tensor, boxes: Boxes, ego: Tensor, of: Mask) -> tuple[tuple[Tensor, ...], judge_kernels.Kept]:
     """The fields of `Weighed`, and what the gradient needs besides."""
-    leading, (tables, side), rooms = observation.shape[:-2], of.tables, of.judge.rooms
-    given = flat(observation, 2), flat(boxes.present, 1), *predicted(ego), flat(boxes.low, 2), flat(boxes.high, 2)
-    *found, kept = filter_kernels.weigh(*given, tables, side, rooms.asked, rooms.rules, of.facts, np.float32(of.band))
+    leading = observation.shape[:-2]
+    given = flat(observation, 2), flat(boxes.present, 1), ego, flat(boxes.low, 2), flat(boxes.high, 2)
+    *found, kept = of.weigh(*given)
     seen, margin, hard, safe = map(torch.from_numpy, found)
     if len(leading) != 1:
         seen, margin, hard, safe = (one.view(*leading, *one.shape[1:]) for one in (seen, margin, hard, safe))
     return (seen, margin, hard, safe), kept
 
 
-def _lower(values: Tensor, margin: Tensor, hard: Tensor, of: Mask) -> tuple[Tensor, tuple[Floats, Floats]]:
-    """The lowered scores, and what the gradient needs."""
-    given, soft = flat(values, 1), flat(margin.detach().div(of.softness).sigmoid(), 1)
-    out, spread = np.empty_like(given), np.empty(len(given), np.float32)
-    filter_kernels.masked(given, flat(hard, 1), soft, of.order, out, spread)
-    return torch.from_numpy(out).view(values.shape), (soft, spread)
+def _score(
+    observation: Tensor, assumed: Assumed, tracks: Tensor | None, ego: Tensor, of: Mask, network: Fused, *, sloped: bool
+) -> tuple[Tensor, Any]:
+    """The scores, and what the gradient needs."""
+    shown = flat(observation, 2)
+    low, high, slopes = assumed.bounds(shown, None if tracks is None else flat(tracks, 2), sloped=sloped)
+    seen, margins, hard, _, kept = of.weigh(shown, shown[..., 0] > 0, ego, low, high)
+    passed = torch.from_numpy(seen)
+    values, behind = network.forward(passed, keeps=sloped and network.keeps(passed))
+    scores, lowered = of.lower(values, torch.from_numpy(margins), torch.from_numpy(hard))
+    return scores.view(*observation.shape[:-2], network.outputs), (slopes, kept, behind, lowered)
 
 
 class _Weigh(torch.autograd.Function):
@@ -152,9 +199,7 @@ class _Weigh(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_seen: Tensor, by_margins: Tensor, *_: Any) -> tuple[Tensor | None, ...]:
-        rooms = ctx.of.judge.rooms
-        given = flat(by_seen, 2), flat(by_margins, 1), *ctx.of.tables
-        found = filter_kernels.weigh_backward(*given, rooms.rules, ctx.of.facts, ctx.kept)
+        found = ctx.of.weigh_backward(flat(by_seen, 2), flat(by_margins, 1), ctx.kept)
         by_shown, by_low, by_high = map(torch.from_numpy, found)
         box = *ctx.shape[:-1], ctx.shape[-1] - 1
         return by_shown.view(ctx.shape), by_low.view(box), by_high.view(box), None, None, None
@@ -163,14 +208,40 @@ class _Weigh(torch.autograd.Function):
 class _Lower(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, margin: Tensor, hard: Tensor, of: Mask) -> Tensor:
-        scores, ctx.kept = _lower(values, margin, hard, of)
+        scores, ctx.kept = of.lower(values, margin, hard)
         ctx.of, ctx.shape = of, margin.shape
         return scores
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, by_out: Tensor) -> tuple[Tensor, Tensor, None, None]:
-        soft, spread = ctx.kept
-        by_x = np.empty_like(soft)
-        filter_kernels.masked_backward(flat(by_out, 1), soft, spread, ctx.of.order, np.float32(ctx.of.softness), by_x)
+        by_x = ctx.of.lower_backward(flat(by_out, 1), *ctx.kept)
         return by_out, torch.from_numpy(by_x).view(ctx.shape), None, None
+
+
+class _Score(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        observation: Tensor,
+        assumed: Assumed,
+        tracks: Tensor | None,
+        ego: Tensor,
+        of: Mask,
+        network: Fused,
+    ) -> Tensor:
+        scores, ctx.kept = _score(observation, assumed, tracks, ego, of, network, sloped=True)
+        ctx.of, ctx.network, ctx.shape = of, network, observation.shape
+        return scores
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_scores: Tensor) -> tuple[Tensor | None, ...]:
+        slopes, kept, behind, lowered = ctx.kept
+        by_seen = ctx.network.backward(behind, by_scores).reshape(slopes.shape[1], *ctx.shape[-2:])
+        by_margins = ctx.of.lower_backward(flat(by_scores, 1), *lowered)
+        by_shown, by_low, by_high = ctx.of.weigh_backward(by_seen, by_margins, kept)
+        by_boxes = np.empty_like(by_shown)
+        box_kernels.boxes_backward(slopes, by_low, by_high, by_boxes)
+        by_shown += by_boxes
+        return torch.from_numpy(by_shown).view(ctx.shape), None, None, None, None, None

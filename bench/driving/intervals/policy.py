@@ -62,6 +62,11 @@ class IntervalPolicy(Policy):
     def safe(self, boxes: Boxes, state: State) -> Tensor | None:
         """Whether an action has a margin of at least 0, bool [...]; None if it promises nothing."""
 
+    def answered(self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, state: State) -> Tensor:
+        """The scores, as in `scores`, with the boxes of a set and of an estimator's tracks (`Assumed.boxes`)."""
+        assert state is not None
+        return self.weighed(observation, self.reckoning.boxes(assumed, observation, state["ego"], tracks), state)
+
     def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
         """As `passed`, for given boxes."""
         return Passed(observation)
@@ -73,7 +78,7 @@ class IntervalPolicy(Policy):
         return self.safe(self.boxes(observation, state), state)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
-        return self.weighed(observation, self.boxes(observation, state), state)
+        return self.answered(observation, self.assumed, None, state)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None

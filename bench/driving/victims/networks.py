@@ -48,7 +48,7 @@ class QNetwork(nn.Module):
         super().__init__()
         self.encoder = Encoder(features)
         self.head = _head(self.encoder.out_features, actions + 1, hidden)
-        self.fused = Fused(_layers(self.head), encoder=self.encoder.layers, dueling=True)
+        self.fused = Fused(self, _layers(self.head), encoder=self.encoder.layers, dueling=True)
 
     def forward(self, observation: Tensor) -> Tensor:
         value, advantage = self.head(self.encoder(observation)).tensor_split([1], -1)
@@ -62,7 +62,7 @@ class StateValue(nn.Module):
         super().__init__()
         self.encoder = Encoder(features)
         self.head = _head(self.encoder.out_features, 1, hidden)
-        self.fused = Fused(_layers(self.head), encoder=self.encoder.layers)
+        self.fused = Fused(self, _layers(self.head), encoder=self.encoder.layers)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.head(self.encoder(observation))
@@ -123,6 +123,18 @@ class QPolicy(Policy):
         return self.scores(observation).gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
+def compiled(policy: Policy, observation: Tensor) -> Fused | None:
+    """The compiled network whose answers about observations [..., V, F] are the scores of a policy; None if torch answers."""
+    if type(policy).scores is not Policy.scores or type(policy).forward is not QPolicy.forward:
+        return None
+    if "forward" in vars(policy) or "scores" in vars(policy) or policy._forward_pre_hooks or policy._forward_hooks:
+        return None
+    network: object = policy.network
+    if type(network) is not QNetwork or network.training:
+        return None
+    return network.fused if network.fused.fits(observation) else None
+
+
 class Actor(nn.Module):
     """mu(s): acceleration and steering [..., 2] within +-limit, from an observation [..., V, F]."""
 
@@ -132,7 +144,7 @@ class Actor(nn.Module):
         self.head = _head(self.encoder.out_features, 2, hidden)
         self.limit: Tensor
         self.register_buffer("limit", limit, persistent=False)
-        self.fused = Fused(_layers(self.head, nn.Tanh), encoder=self.encoder.layers, scale=limit)
+        self.fused = Fused(self, _layers(self.head, nn.Tanh), encoder=self.encoder.layers, scale=limit)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.head(self.encoder(observation)).tanh() * self.limit

@@ -11,6 +11,7 @@ from torch import Tensor
 from cavbench.detection.victims import matching
 from cavbench.detection.victims.examples import Example
 from cavbench.detection.victims.matching import Answer
+from cavbench.errors import UserError
 
 SIDE = 128
 BOXES = torch.tensor([[30.0, 30, 60, 64], [70, 20, 100, 60], [10, 80, 50, 120]])
@@ -55,6 +56,12 @@ def test_the_cheapest_whole_is_taken_and_not_the_cheapest_pair() -> None:
     here = torch.tensor([[14.0, 10, 44, 40], [2, 10, 32, 40]])
     queries, objects = matching.matched(here, torch.zeros(2, 1), boxes, torch.zeros(2, dtype=torch.int64), SIDE, 1)
     assert list(zip(queries.tolist(), objects.tolist(), strict=True)) == [(0, 1), (1, 0)]
+
+
+def test_a_training_that_has_diverged_ends_with_a_line(known: Answer) -> None:
+    known.boxes[0, 0, 0] = torch.nan
+    with pytest.raises(UserError, match="its training has diverged: try a lower learning rate"):
+        pairs(known)
 
 
 def test_with_copies_several_queries_learn_an_object(known: Answer) -> None:

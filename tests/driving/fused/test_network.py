@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from typing import Any
 from unittest.mock import patch
 
 import pytest
@@ -147,6 +148,82 @@ def test_torch_answers_where_more_is_wanted(policy: Policy, more: Callable[[Poli
     more(policy)
     asked = x.double() if next(iter(policy.parameters())).dtype == torch.float64 else x
     assert used(lambda: policy.scores(asked))[1] == 0
+
+
+def linears(network: nn.Module) -> list[tuple[nn.Module, str]]:
+    """Each linear layer, as the module that has it, and its name there."""
+    return [
+        (parent, name)
+        for parent in network.modules()
+        for name, one in parent.named_children()
+        if isinstance(one, nn.Linear) and one.bias is not None
+    ]
+
+
+def another_layer(network: nn.Module, place: int) -> None:
+    parent, name = linears(network)[place]
+    old = getattr(parent, name)
+    setattr(parent, name, nn.Linear(old.in_features, old.out_features).requires_grad_(False))
+
+
+def another_activation(network: nn.Module) -> None:
+    for parent in network.modules():
+        for name, one in parent.named_children():
+            if isinstance(one, (nn.ReLU, nn.Tanh)):
+                setattr(parent, name, nn.ELU())
+
+
+def another_forward(network: nn.Module) -> None:
+    forward = network.forward
+    network.forward = lambda *given: 0.5 * forward(*given)  # type: ignore[method-assign]
+
+
+def clipped_activations(network: nn.Module) -> None:
+    """As some defences do."""
+    for one in network.modules():
+        if isinstance(one, (nn.ReLU, nn.Tanh)):
+            one.register_forward_hook(lambda module, given, answer: answer.clamp(max=0.05))
+
+
+class Halved(nn.Linear):
+    def forward(self, given: Tensor) -> Tensor:
+        return super().forward(given) / 2
+
+
+def another_class(network: nn.Module) -> None:
+    parent, name = linears(network)[-1]
+    getattr(parent, name).__class__ = Halved
+
+
+CHANGES: dict[str, Callable[[nn.Module], object]] = {
+    "first layer": lambda network: another_layer(network, 0),
+    "last layer": lambda network: another_layer(network, -1),
+    "activations": another_activation,
+    "hooks of activations": clipped_activations,
+    "forward": another_forward,
+    "hook": lambda network: network.register_forward_hook(lambda module, given, answer: answer * 2),
+    "class of a layer": another_class,
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
+def test_a_network_that_was_changed_answers_as_torch_does(policy: Any, change: Callable[[nn.Module], object]) -> None:
+    """A defence may change the network of the victim that it has loaded."""
+    x = observation((20,))
+    before = policy.scores(x)
+    change(policy.actor if isinstance(policy, ActorPolicy) else policy.network)
+    found = policy.scores(x)
+    torch.testing.assert_close(found, by_torch(lambda: policy.scores(x)))
+    assert not torch.allclose(found, before)
+
+
+def test_another_limit_of_an_actor_counts() -> None:
+    policy = POLICIES["ddpg"]().requires_grad_(False).eval()
+    assert isinstance(policy, ActorPolicy)
+    x = observation((20,))
+    before = policy.scores(x)
+    policy.actor.limit = policy.actor.limit / 2
+    torch.testing.assert_close(policy.scores(x), before / 2)
 
 
 def test_the_watch_sees_that_its_layers_were_exchanged() -> None:

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from tensordict import TensorDict
 from torch import Tensor
 
+from cavbench.defenses.driving import shield
 from cavbench.defenses.driving.shield import Shield, Shielded
-from cavbench.driving import Policy
+from cavbench.driving import Policy, State
 from cavbench.driving.intervals import filter_kernels
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego, reckoned
@@ -175,6 +176,50 @@ def test_boxes_within_tracks_and_their_gradients_are_those_of_torch(seed: int) -
 
     # At a tie torch halves the gradient; no two bounds here are equal.
     torch.testing.assert_close(slope(found, asked), slope(wanted, other), atol=1e-5, rtol=1e-6)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 10_000), any_start=st.booleans(), tracked=st.booleans())
+def test_one_node_has_the_bits_of_boxes_filter_and_network_one_after_the_other(
+    seed: int, any_start: bool, tracked: bool
+) -> None:
+    policy, (shown, state) = shielded(any_start=any_start), drawn(seed, 200)
+    tracks, generator = None, torch.Generator().manual_seed(seed)
+    if tracked:
+        near = policy.assumed.boxes(shown)
+        low, high = (one[:, 1:] + 0.3 * torch.randn(200, ROWS - 1, 4, generator=generator) for one in near[1:])
+        tracks = torch.cat((torch.ones(200, ROWS - 1, 1), low, high), -1)
+    weights = torch.randn(200, len(FACTS.actions), generator=generator)
+
+    def both(asked: Tensor) -> tuple[Tensor, Tensor]:
+        scores = policy.answered(asked, policy.assumed, tracks, state)
+        return scores.detach(), torch.autograd.grad((scores * weights).sum(), asked)[0]
+
+    with patch.object(Mask, "scores", autospec=True, side_effect=Mask.scores) as node:
+        scores, slope = both(shown.clone().requires_grad_())
+        assert node.call_count == 1
+    with patch.object(shield, "compiled", return_value=None):
+        in_turn, slope_in_turn = both(shown.clone().requires_grad_())
+    assert torch.equal(scores, in_turn)
+    assert torch.equal(slope, slope_in_turn)
+    assert torch.equal(policy.answered(shown, policy.assumed, tracks, state), scores)
+    assert bool(slope.any())
+
+
+def test_one_node_has_the_same_bits_in_every_batch_and_dimension() -> None:
+    policy = shielded()
+    has_the_same_bits_everywhere(policy.scores, *drawn(1, 120))
+    takes_several_dimensions_and_none(policy.scores, *drawn(2, 60))
+
+
+def test_a_shield_that_weighs_otherwise_is_asked() -> None:
+    class Halved(Shielded):
+        def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
+            return super().weighed(observation, boxes, state) / 2
+
+    usual, (shown, state) = shielded(), drawn(3, 40)
+    halved = Halved(Shield(), usual.policy, FACTS)
+    assert torch.equal(halved.scores(shown, state), usual.scores(shown, state) / 2)
 
 
 def test_a_tracked_filter_drives_as_by_torch() -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cavbench.driving import Policy
 from cavbench.driving.victims.logits import SoftPolicy
-from cavbench.driving.victims.networks import ActorPolicy, QPolicy
+from cavbench.driving.victims.networks import ActorPolicy, QPolicy, compiled
 
 
 def observation(batch: tuple[int, ...], seed: int = 0) -> Tensor:
@@ -49,6 +49,33 @@ def test_the_row_of_an_absent_car_has_no_effect(policy: Policy) -> None:
     y = x.clone()
     y[..., 1:] += (x[..., :1] == 0) * torch.rand_like(x[..., 1:])
     torch.testing.assert_close(policy.scores(y), policy.scores(x))
+
+
+def test_only_the_network_that_gives_a_policys_scores_stands_for_it(policy: Policy) -> None:
+    x = observation((4,))
+    network = compiled(policy.requires_grad_(False).eval(), x)
+    if isinstance(policy, ActorPolicy):
+        assert network is None
+        return
+    assert network is not None
+    assert torch.equal(network(x), policy.scores(x))
+    assert compiled(policy, x.double()) is None
+    policy.register_forward_hook(lambda *_: None)
+    assert compiled(policy, x) is None
+
+
+def test_no_network_stands_for_a_policy_that_does_more() -> None:
+    class Doubled(QPolicy):
+        def forward(self, observation: Tensor) -> Tensor:
+            return 2 * super().forward(observation)
+
+    x = observation((4,))
+    assert compiled(Doubled(5, 5, 16).requires_grad_(False).eval(), x) is None
+    policy = QPolicy(5, 5, 16).requires_grad_(False).eval()
+    policy.forward = lambda observation: observation.sum((-2, -1))  # type: ignore[method-assign]
+    assert compiled(policy, x) is None
+    assert compiled(QPolicy(5, 5, 16).requires_grad_(False).train(), x) is None
+    assert compiled(QPolicy(5, 5, 16).eval(), x) is None
 
 
 def test_the_actor_stays_within_its_steering_limit() -> None:

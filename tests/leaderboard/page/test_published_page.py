@@ -31,7 +31,7 @@ def test_without_records_the_leaderboard_on_the_terminal_is_the_published_one() 
     leaderboard_report({}, console)
     said = console.file.getvalue()  # type: ignore[attr-defined]
     assert "driving in highway, standard-v2, relative 0.1" in said
-    assert re.search(r"1 +tracker\+shield +dqn", said)
+    assert re.search(r"1 +shield +dqn", said)
 
 
 def test_reports_import_no_torch(published_site: Path) -> None:

@@ -1,0 +1,177 @@
+"""Modes of torch: what changes the numbers of its functions for all code of the process.
+
+An attack that leaves one on would change the victim, or what enforces the threat model, without touching either.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import torch
+from torch.nn.modules import module as modules
+
+from cavbench.isolation.watch import Side, TamperError
+
+HOOKS = (
+    modules._global_forward_hooks,
+    modules._global_forward_pre_hooks,
+    modules._global_backward_hooks,
+    modules._global_backward_pre_hooks,
+)
+ELSEWHERE = ("/Meta", "/CUDA", "/MPS", "/XPU")
+"""Ends of the names of operators that compute nothing, or on other devices: torch adds some whenever it imports more."""
+STACKS = (
+    "a mode of torch's functions",
+    "a mode of torch's operations",
+    "a transform of functions",
+    "a hook of all saved tensors",
+    "a hook of all modules",
+    "an operator of its own",
+)
+"""What `stacked` counts, as messages call it."""
+
+
+class Modes:
+    """The modes of torch as they are now. They are the run's: the victim is asked, and scores are computed, in them."""
+
+    def __init__(self) -> None:
+        self._stacked, self._numbers = stacked(), numbers()
+        self._theirs = self._numbers
+
+    def check(self, did: str, *sides: Side) -> None:
+        """Raise if more or less is on torch's stacks than at first.
+
+        Args:
+            did: what was done with it, as "left".
+            sides: whose code ran.
+
+        Raises:
+            TamperError: if so.
+        """
+        found = stacked()
+        if found != self._stacked:
+            changed = [noun for noun, here, before in zip(STACKS, found, self._stacked, strict=True) if here != before]
+            whose = " or the ".join(sides)
+            raise TamperError(
+                f"the {whose} {did} {' and '.join(changed)}: it changes what torch computes for others", *sides
+            )
+
+    def settle(self, *sides: Side) -> None:
+        """Put back what changes numbers, after code of these sides ran.
+
+        Raises:
+            TamperError: if it left something on torch's stacks, which cannot be put back.
+        """
+        self.check("left", *sides)
+        if numbers() != self._numbers:
+            put(self._numbers)
+
+    @contextmanager
+    def for_victim(self) -> Iterator[None]:
+        """Answer in the middle of an attack's code: with the run's numbers. The attack has its own again after that.
+
+        Raises:
+            TamperError: if something of the attack is on torch's stacks.
+        """
+        self.check("asked under", "attack")
+        self._theirs = numbers()
+        if self._theirs != self._numbers:
+            put(self._numbers)
+        try:
+            yield
+        finally:
+            if self._theirs != self._numbers:
+                put(self._theirs)
+
+    @contextmanager
+    def for_attack(self) -> Iterator[None]:
+        """Run code of the attack in the middle of an answer: with the attack's numbers.
+
+        Raises:
+            TamperError: if it leaves something on torch's stacks.
+        """
+        if self._theirs != self._numbers:
+            put(self._theirs)
+        try:
+            yield
+        finally:
+            self._theirs = numbers()
+            if self._theirs != self._numbers:
+                put(self._numbers)
+        self.check("left", "attack")
+
+
+@contextmanager
+def kept(*sides: Side) -> Iterator[None]:
+    """Run code of these sides; the modes are as before after it.
+
+    Raises:
+        TamperError: if it left something on torch's stacks.
+    """
+    modes = Modes()
+    yield
+    modes.settle(*sides)
+
+
+class _Replaced:
+    """Counts torch's operators for the processor that Python code implements."""
+
+    def __init__(self) -> None:
+        self._known, self._count = 0, 0
+
+    def __call__(self) -> int:
+        made = torch.library._impls
+        if len(made) != self._known:
+            self._known = len(made)
+            self._count = sum(name.startswith("aten/") and not name.endswith(ELSEWHERE) for name in made)
+        return self._count
+
+
+_replaced = _Replaced()
+
+
+def stacked() -> tuple[int, ...]:
+    """How much is on each of torch's stacks."""
+    return (
+        torch._C._len_torch_function_stack(),
+        torch._C._len_torch_dispatch_stack(),
+        torch._C._functorch.maybe_current_level() or 0,
+        int(torch._C._autograd._top_saved_tensors_default_hooks(True) is not None),
+        sum(map(len, HOOKS)),
+        _replaced(),
+    )
+
+
+class Numbers(NamedTuple):
+    """The default type, automatic types (whether, and which) on the processor and a GPU, the precision of products, oneDNN."""
+
+    default: torch.dtype
+    automatic: bool
+    automatic_type: torch.dtype
+    automatic_on_gpu: bool
+    precision: str
+    one_dnn: bool
+
+
+def numbers() -> Numbers:
+    """What changes numbers, as it is now."""
+    return Numbers(
+        torch.get_default_dtype(),
+        torch.is_autocast_enabled("cpu"),
+        torch.get_autocast_dtype("cpu"),
+        torch.is_autocast_enabled("cuda"),
+        torch.get_float32_matmul_precision(),
+        bool(torch.backends.mkldnn.enabled),
+    )
+
+
+def put(wanted: Numbers) -> None:
+    """Set what `numbers` returned."""
+    torch.set_default_dtype(wanted.default)
+    torch.set_autocast_enabled("cpu", wanted.automatic)
+    torch.set_autocast_dtype("cpu", wanted.automatic_type)
+    torch.set_autocast_enabled("cuda", wanted.automatic_on_gpu)
+    torch.set_float32_matmul_precision(wanted.precision)
+    torch.backends.mkldnn.enabled = wanted.one_dnn  # type: ignore[assignment]

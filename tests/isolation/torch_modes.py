@@ -1,0 +1,86 @@
+"""What changes the numbers of torch for all code of a process, and is still on after the code that switched it on."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any, Self
+
+import torch
+from torch.autograd.graph import saved_tensors_hooks
+from torch.nn.modules.module import register_module_forward_hook
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from cavbench.isolation.modes import stacked
+
+
+class Functions(TorchFunctionMode):
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return func(*args, **(kwargs or {}))
+
+
+class Operations(TorchDispatchMode):
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        return func(*args, **(kwargs or {}))
+
+
+class ModuleHook(AbstractContextManager[None]):
+    def __enter__(self) -> None:
+        self.handle = register_module_forward_hook(lambda module, given, answer: None)
+
+    def __exit__(self, *about: object) -> None:
+        self.handle.remove()
+
+
+class Operator(AbstractContextManager[None]):
+    def __enter__(self) -> None:
+        self.library = torch.library.Library("aten", "IMPL")
+        with warnings.catch_warnings(action="ignore"):
+            self.library.impl("erfinv", lambda values: values * 0, "CPU")
+
+    def __exit__(self, *about: object) -> None:
+        self.library._destroy()
+
+
+Mode = Callable[[], AbstractContextManager[Any]]
+STACKED: dict[str, Mode] = {
+    "a mode of torch's functions": Functions,
+    "a mode of torch's operations": Operations,
+    "a hook of all saved tensors": lambda: saved_tensors_hooks(lambda x: x, lambda x: x),
+    "a hook of all modules": ModuleHook,
+    "an operator of its own": Operator,
+}
+NUMBERS: dict[str, Callable[[], object]] = {
+    "default": lambda: torch.set_default_dtype(torch.float64),
+    "automatic": lambda: torch.set_autocast_enabled("cpu", True),
+    "automatic_type": lambda: torch.set_autocast_dtype("cpu", torch.float16),
+    "automatic_on_gpu": lambda: torch.set_autocast_enabled("cuda", True),
+    "precision": lambda: torch.set_float32_matmul_precision("medium"),
+    "one_dnn": lambda: setattr(torch.backends.mkldnn, "enabled", False),
+}
+
+
+class Left:
+    """A mode that is entered once, and left at the end of a test: `with Left(NAME) as mode: ... mode.enter()`."""
+
+    def __init__(self, name: str) -> None:
+        self.mode, self.entered, self.before = STACKED[name](), False, stacked()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *about: object) -> None:
+        self.leave()
+        assert stacked() == self.before
+
+    def enter(self) -> None:
+        if not self.entered:
+            self.entered = True
+            self.mode.__enter__()
+
+    def leave(self) -> None:
+        if self.entered:
+            self.entered = False
+            self.mode.__exit__(None, None, None)
