@@ -102,7 +102,8 @@ class Tracked(PolicyWrapper):
     def _estimate(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         """The observation [..., V, F] with the middles of the boxes and the reckoned ego."""
         assert state is not None
-        middle = self.assumed.normalised((boxes.low + boxes.high) / 2)
-        measured = torch.where(middle.isfinite() & boxes.present.unsqueeze(-1), middle, observation[..., 1:])
+        middle = self.assumed.normalised(self.reckoning.middles(boxes, observation.shape[-2]))
+        present = observation[..., :1] > 0
+        measured = torch.where(middle.isfinite() & present, middle, observation[..., 1:])
         estimate = torch.cat((observation[..., :1], measured), -1)
         return self.reckoning.corrected(estimate, self.reckoning.now(boxes, state["ego"]), boxes, self.assumed)

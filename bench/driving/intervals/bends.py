@@ -266,6 +266,24 @@ class BentReckoning(DeadReckoning):
     def after(self, ego: Ego, action: Tensor) -> Tensor:
         raise NotImplementedError("on a way, `step` knows the station")
 
+    def middles(self, boxes: Boxes, rows: int) -> Tensor:
+        middle = (boxes.low + boxes.high)[..., :rows, :] / 2
+        own, others = middle[..., :1, :], middle[..., 1:, :]
+        places = torch.cat([own, others + own], -2)
+        direction, curvature = directions(self.way, places[..., 0])
+        place = torch.stack(points(self.way, places[..., 0], places[..., 1]), -1)
+        speeds = places[..., 2:]
+        # The ego's row has the speeds in the direction in which it moves; it points elsewhere.
+        points_to = direction[..., :1] - slip(curvature[..., :1], self.kinematics)
+        cos, sin = (turn(torch.cat([points_to, direction[..., 1:]], -1)) for turn in (torch.cos, torch.sin))
+        velocity = torch.stack(
+            [speeds[..., 0] * cos - speeds[..., 1] * sin, speeds[..., 0] * sin + speeds[..., 1] * cos], -1
+        )
+        seen = torch.cat([place, velocity], -1)
+        # A car that is nowhere on the road has no middle.
+        nowhere = boxes.high[..., 1:rows, :1] > FAR / 2
+        return torch.cat([seen[..., :1, :], torch.where(nowhere, torch.inf, seen[..., 1:, :] - seen[..., :1, :])], -2)
+
     def corrected(self, observation: Tensor, ego: Ego, boxes: Boxes, assumed: Assumed) -> Tensor:
         station = boxes.low[..., 0, 0]
         direction, curvature = directions(self.way, station)

@@ -117,6 +117,10 @@ class DeadReckoning:
         """
         return assumed.boxes(shown, tracks)
 
+    def middles(self, boxes: Boxes, rows: int) -> Tensor:
+        """The middles of the boxes of the shown rows, in the frame of the world, [..., V, F - 1]."""
+        return (boxes.low + boxes.high) / 2
+
     def corrected(self, observation: Tensor, ego: Ego, boxes: Boxes, assumed: Assumed) -> Tensor:
         """The observation [..., V, F] with the reckoned y, vx and vy in the ego's row."""
         along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()

@@ -198,6 +198,23 @@ def test_a_car_that_gets_out_of_sight_is_remembered() -> None:
     assert float(cars_of(moves.now(boxes, step.after), boxes, CAR).low[0, 9, 0]) < stands - float(step.after[0, 7])
 
 
+def test_a_driver_without_intervals_is_shown_the_middles_in_the_frame_of_the_world() -> None:
+    policy = Tracked(Tracker(assumed_budget=0.0, assumed_noise=0.0), Fastest(), FACTS)
+    env = WORLD.build([WORLD.home] * len(SEEDS), Control())
+    td = env.reset(TensorDict({"seed": torch.tensor(SEEDS)}, batch_size=env.batch_size))
+    state = policy.initial(torch.tensor(SEEDS))
+    for _ in range(60):
+        shown = td["observation"]
+        passed = policy.passed(shown, state).observation
+        near = (FACTS.features.physical(shown)[..., :2].norm(dim=-1) < 40) & (shown[..., 0] > 0) & ~td["done"]
+        apart = (FACTS.features.physical(passed) - FACTS.features.physical(shown)).abs()
+        assert passed.shape == shown.shape
+        assert float(apart[near].median(0).values.max()) < 0.1
+        action = torch.full((len(SEEDS),), 1)
+        state = policy.advance(shown, action, state)
+        td = env.step(td.set("action", action))["next"]
+
+
 def test_every_shown_value_of_a_car_near_by_has_a_gradient() -> None:
     policy = Tracked(Tracker(), Shielded(Shield(), Fastest(), FACTS), FACTS)
     env = WORLD.build([WORLD.home] * len(SEEDS), Control())
