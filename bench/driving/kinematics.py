@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from cavbench.driving.way import Way
+
 
 @dataclass(frozen=True, kw_only=True)
 class CarFollowing:
@@ -51,6 +53,7 @@ class Kinematics:
         steering_limit: of the continuous action, in rad.
         following: how other cars keep their distance.
         oncoming: whether cars may come towards the ego, on a lane that it may use.
+        way: the way that all cars follow if the lanes bend; None if they are straight.
     """
 
     frames: int
@@ -69,3 +72,4 @@ class Kinematics:
     steering_limit: float
     following: CarFollowing
     oncoming: bool = False
+    way: Way | None = None

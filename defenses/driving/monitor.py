@@ -57,6 +57,8 @@ class Monitor(DrivingDefense):
                 "the fallback drivers of defense 'monitor' take discrete actions, this victim's are continuous: "
                 "use defense.fallback=none"
             )
+        if facts.kinematics is not None and facts.kinematics.way is not None:
+            raise UserError("defense 'monitor' needs straight parallel lanes: on this world's road they bend")
         planner = None
         if self.fallback == "planner":
             planner = Tracker(assumed_budget=self.assumed_budget).load(Planner(), seed, facts)

@@ -15,7 +15,7 @@ from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy
 from cavbench.driving.intervals.belief import Belief
 from cavbench.driving.intervals.boxes import Boxes
 from cavbench.driving.intervals.ego import Ego, Step
-from cavbench.driving.intervals.policy import IntervalPolicy, corrected, remembers, with_inner
+from cavbench.driving.intervals.policy import IntervalPolicy, remembers, with_inner
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
 
@@ -56,6 +56,8 @@ class Believing(IntervalPolicy):
 
     def __init__(self, settings: PessimistQ, policy: Policy, facts: DrivingFacts) -> None:
         super().__init__(facts, policy.action_type, settings.assumed_norm, settings.assumed_budget)
+        if self.reckoning.kinematics.way is not None:
+            raise UserError("defense 'pessimist_q' needs straight parallel lanes: on this world's road they bend")
         self.policy, self.settings = policy, settings
         self.driver, self.weights_sha256 = policy.driver, policy.weights_sha256
         self.compiled = Belief(self.reckoning, self.assumed)
@@ -72,7 +74,7 @@ class Believing(IntervalPolicy):
         else:
             points, ego = self.belief(observation, boxes), self.reckoning.now(boxes, state["ego"])
             ego = Ego(*(value.expand(len(points), *value.shape) for value in ego))
-            points = corrected(points, ego, self.assumed)
+            points = self.reckoning.corrected(points, ego, boxes, self.assumed)
         inner = state.get("inner", None)
         inner = None if inner is None else inner.expand(len(points), *state.batch_size)
         values = self.policy.scores(points, inner)
@@ -84,7 +86,8 @@ class Believing(IntervalPolicy):
         ego, after = step
         inner = state.get("inner", None)
         if remembers(self.policy):
-            middle = corrected(self.belief(observation, boxes, corners=False)[0], ego, self.assumed)
+            middle = self.belief(observation, boxes, corners=False)[0]
+            middle = self.reckoning.corrected(middle, ego, boxes, self.assumed)
             inner = self.policy.advance(middle, action, inner)
         return with_inner({"ego": after}, inner, state.batch_size)
 

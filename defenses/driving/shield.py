@@ -17,7 +17,7 @@ from cavbench.driving.intervals.corridor import Corridor, CorridorJudge
 from cavbench.driving.intervals.ego import Ego, Step
 from cavbench.driving.intervals.margins import Judge, Margins
 from cavbench.driving.intervals.mask import Mask
-from cavbench.driving.intervals.policy import IntervalPolicy, corrected, remembers, with_inner
+from cavbench.driving.intervals.policy import IntervalPolicy, remembers, with_inner
 from cavbench.driving.intervals.rooms import Caution, cars_of
 from cavbench.driving.threat import Norm
 from cavbench.driving.victims.networks import compiled
@@ -85,7 +85,7 @@ class Filter(IntervalPolicy):
         ego, after = step
         inner = state.get("inner", None)
         if remembers(self.policy):
-            inner = self.policy.advance(corrected(observation, ego, self.assumed), action, inner)
+            inner = self.policy.advance(self.reckoning.corrected(observation, ego, boxes, self.assumed), action, inner)
         return with_inner({"ego": after, **self.kept(ego, boxes, state)}, inner, state.batch_size)
 
     def kept(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> dict[str, Tensor]:
@@ -94,8 +94,11 @@ class Filter(IntervalPolicy):
 
     def value(self, observation: Tensor, action: Tensor, state: State = None) -> Tensor:
         assert state is not None
-        ego = self.ego(self.assumed.boxes(observation), state)
-        return self.policy.value(corrected(observation, ego, self.assumed), action, state.get("inner", None))
+        boxes = self.boxes(observation, state)
+        ego = self.ego(boxes, state)
+        return self.policy.value(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), action, state.get("inner", None)
+        )
 
     def ego(self, boxes: Boxes, state: TensorDictBase) -> Ego:
         return self.reckoning.now(boxes, state["ego"])
@@ -123,7 +126,9 @@ class Shielded(Filter):
             found = self.mask(observation, boxes, state["ego"])
             return self.mask.lowered(self.policy.scores(found.seen, state.get("inner", None)), found)
         ego = self.ego(boxes, state)
-        values = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
+        values = self.policy.scores(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), state.get("inner", None)
+        )
         allowed = self.allowed(self.margins(ego, boxes))
         # The masked values are below the others; no step of this hides the victim's gradient.
         spread = (values.amax(-1, keepdim=True) - values.amin(-1, keepdim=True)).detach() + 1
@@ -135,7 +140,10 @@ class Shielded(Filter):
             found = self.mask(observation, boxes, state["ego"])
             return Passed(found.seen, found.hard[..., self.reckoning.order] > 0)
         ego = self.ego(boxes, state)
-        return Passed(corrected(observation, ego, self.assumed), self.allowed(self.margins(ego, boxes)) > 0.5)
+        return Passed(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed),
+            self.allowed(self.margins(ego, boxes)) > 0.5,
+        )
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
@@ -146,7 +154,7 @@ class Shielded(Filter):
         return self.margins(self.ego(boxes, state), boxes).safe
 
     def margins(self, ego: Ego, boxes: Boxes) -> Margins:
-        return self.judge(ego, cars_of(ego, boxes))
+        return self.judge(ego, cars_of(ego, boxes, self.reckoning.kinematics))
 
     def allowed(self, margins: Margins) -> Tensor:
         """[..., A] 1 for the allowed actions and 0 for the others, with the gradient of a soft threshold (straight-through)."""
@@ -184,7 +192,9 @@ class ShieldedControls(Filter):
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
         ego = self.ego(boxes, state)
-        wanted = self.policy.scores(corrected(observation, ego, self.assumed), state.get("inner", None))
+        wanted = self.policy.scores(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), state.get("inner", None)
+        )
         left = self.corridor(ego, boxes, state)
         # The gradient of the bound that holds, and that of the victim as if there were none (straight-through).
         return torch.minimum(torch.maximum(wanted.detach(), left.low), left.high) + wanted - wanted.detach()
@@ -193,16 +203,18 @@ class ShieldedControls(Filter):
         assert state is not None
         ego = self.ego(boxes, state)
         left = self.corridor(ego, boxes, state)
-        return Passed(corrected(observation, ego, self.assumed), torch.stack([left.low, left.high], -2))
+        return Passed(
+            self.reckoning.corrected(observation, ego, boxes, self.assumed), torch.stack([left.low, left.high], -2)
+        )
 
     def safe(self, boxes: Boxes, state: State) -> Tensor:
         assert state is not None
         return self.corridor(self.ego(boxes, state), boxes, state).safe
 
     def corridor(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Corridor:
-        return self.judge(ego, cars_of(ego, boxes), self.edge(ego, boxes, state))
+        return self.judge(ego, cars_of(ego, boxes, self.reckoning.kinematics), self.edge(ego, boxes, state))
 
     def edge(self, ego: Ego, boxes: Boxes, state: TensorDictBase) -> Tensor:
         """The highest lane [...] that is known to exist: the ego was in it, or a car surely was."""
-        lane = cars_of(ego, boxes).rightmost(self.reckoning.kinematics.lane_width)
+        lane = cars_of(ego, boxes, self.reckoning.kinematics).rightmost(self.reckoning.kinematics.lane_width)
         return torch.maximum(torch.maximum(lane, ego.target_lane), state["edge"])

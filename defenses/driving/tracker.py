@@ -12,7 +12,7 @@ from torch import Tensor
 from cavbench.core.ranges import NotNegative
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Passed, Policy, PolicyWrapper, State
 from cavbench.driving.intervals.boxes import Assumed, Boxes
-from cavbench.driving.intervals.policy import IntervalPolicy, corrected, reckoning, remembers, with_inner
+from cavbench.driving.intervals.policy import IntervalPolicy, reckoning, remembers, with_inner
 from cavbench.driving.intervals.tracks import predicted
 from cavbench.driving.threat import Norm
 
@@ -97,12 +97,13 @@ class Tracked(PolicyWrapper):
     def boxes(self, observation: Tensor, state: State) -> Boxes:
         """What is known about every row, from this observation [..., V, F] and those before."""
         assert state is not None
-        return self.assumed.boxes(observation, state.get("tracks", None))
+        return self.reckoning.boxes(self.assumed, observation, state["ego"], state.get("tracks", None))
 
     def _estimate(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         """The observation [..., V, F] with the middles of the boxes and the reckoned ego."""
         assert state is not None
-        middle = self.assumed.normalised((boxes.low + boxes.high) / 2)
-        measured = torch.where(middle.isfinite() & boxes.present.unsqueeze(-1), middle, observation[..., 1:])
+        middle = self.assumed.normalised(self.reckoning.middles(boxes, observation.shape[-2]))
+        present = observation[..., :1] > 0
+        measured = torch.where(middle.isfinite() & present, middle, observation[..., 1:])
         estimate = torch.cat((observation[..., :1], measured), -1)
-        return corrected(estimate, self.reckoning.now(boxes, state["ego"]), self.assumed)
+        return self.reckoning.corrected(estimate, self.reckoning.now(boxes, state["ego"]), boxes, self.assumed)

@@ -11,8 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavbench.driving import Features
+from cavbench.driving.way import Way
 from cavbench.envs.roads import u_turn
 from cavbench.envs.roads.axes import U_TURN, U_TURN_V1
+from cavbench.envs.roads.bends import way_round
 from cavbench.envs.roads.config import Scene, TaskKind
 from cavbench.envs.roads.network import record
 from cavbench.envs.roads.state import Measure
@@ -29,6 +31,12 @@ def _road(connected: bool) -> NDArray[np.void]:
     """The network. It is cached because the engine tells roads apart by their identity."""
     network = u_turn.u_turn(connected=connected)
     return record(network, spots=u_turn.spots(network), destinations=u_turn.DESTINATIONS, way=u_turn.WAY)
+
+
+@cache
+def _way(connected: bool) -> Way:
+    """The ego starts at the beginning of the left lane."""
+    return way_round(u_turn.u_turn(connected=connected), u_turn.WAY.roads, start=0.0, start_lane=0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +57,13 @@ class UTurnWorld(RoadsWorld):
         "shoulder": 1.0,
     }
 
+    start_speed: ClassVar[float | None] = 16.0
     target_speeds: tuple[float, ...] = SPEEDS
     max_steps: int = 450
+
+    @property
+    def way(self) -> Way:
+        return _way(self.connected)
 
     def scene(self, cell: Cell) -> Scene:
         cars = max(1, round(CARS * cell.density))

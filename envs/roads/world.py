@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from cavbench.driving import ActionType, Control, Driver, DrivingFacts, DrivingWorld, Dynamics, Features, Kinematics
+from cavbench.driving.way import Way
 from cavbench.envs.highway.config import ACTIONS, KINEMATICS, STANDARD_FEATURES, STANDARD_TARGET_SPEEDS
 from cavbench.envs.roads.config import RoadsConfig, Scene
 from cavbench.envs.roads.shape import drawn
@@ -51,9 +52,11 @@ class RoadsWorld(DrivingWorld):
     lane_changes: ClassVar[bool] = True
     """Whether the other cars change lanes."""
     start_speed: ClassVar[float | None] = None
-    """The ego's speed at the start in m/s, if it drives on straight parallel lanes, so that a policy can predict its motion."""
+    """The ego's speed at the start in m/s, if it drives on parallel lanes, so that a policy can predict its motion."""
     comes_towards: ClassVar[bool] = False
     """Whether others come towards the ego on one of these lanes."""
+    lane_width: ClassVar[float] = KINEMATICS["lane_width"]
+    """Of the lanes, in m."""
 
     connected: bool = True
     observed_vehicles: int = 10
@@ -91,8 +94,19 @@ class RoadsWorld(DrivingWorld):
         if self.start_speed is None:
             return None
         frames = self.simulation_frequency // self.policy_frequency
-        constants = {**KINEMATICS, "start_speed": self.start_speed, "oncoming": self.comes_towards}
+        constants = {
+            **KINEMATICS,
+            "lane_width": self.lane_width,
+            "start_speed": self.start_speed,
+            "oncoming": self.comes_towards,
+            "way": self.way,
+        }
         return Kinematics(frames=frames, target_speeds=self.target_speeds, **constants)
+
+    @property
+    def way(self) -> Way | None:
+        """The way that all cars follow, if the lanes bend."""
+        return None
 
     @property
     def observed_rows(self) -> int:

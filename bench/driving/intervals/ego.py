@@ -12,7 +12,7 @@ from torch import Tensor
 
 from cavbench.driving.features import ActionType
 from cavbench.driving.intervals import motion_kernels
-from cavbench.driving.intervals.boxes import Boxes, flat
+from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.motion_kernels import OFF_THE_ROAD, SLACK, UNKNOWN_EDGE
 from cavbench.driving.kinematics import Kinematics
 
@@ -105,6 +105,28 @@ class DeadReckoning:
     def unknown(self, episodes: Tensor) -> Tensor:
         """The state before the first observation, as of `reckoned`, [B, 7]."""
         return torch.zeros(len(episodes), 1 + len(Ego._fields), device=episodes.device)
+
+    def boxes(self, assumed: Assumed, shown: Tensor, state: Tensor, tracks: Tensor | None = None) -> Boxes:
+        """The true values behind a shown observation [..., V, F], as of `Assumed.boxes`, in the frame of the road.
+
+        Args:
+            assumed: the perturbation set.
+            shown: the observation.
+            state: the reckoned ego.
+            tracks: what `tracks.predicted` gave for the same episodes.
+        """
+        return assumed.boxes(shown, tracks)
+
+    def middles(self, boxes: Boxes, rows: int) -> Tensor:
+        """The middles of the boxes of the shown rows, in the frame of the world, [..., V, F - 1]."""
+        return (boxes.low + boxes.high) / 2
+
+    def corrected(self, observation: Tensor, ego: Ego, boxes: Boxes, assumed: Assumed) -> Tensor:
+        """The observation [..., V, F] with the reckoned y, vx and vy in the ego's row."""
+        along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
+        own = assumed.normalised(torch.stack([torch.zeros_like(along), ego.y, along, across], -1))[..., 1:]
+        row = torch.cat((observation[..., :1, :2], own.unsqueeze(-2)), -1)
+        return torch.cat((row, observation[..., 1:, :]), -2)
 
     def now(self, boxes: Boxes, state: Tensor) -> Ego:
         """The ego's motion at this observation: the prediction, moved into the measured row's box."""

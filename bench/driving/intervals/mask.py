@@ -77,7 +77,7 @@ class Mask:
 
     def fits(self, observation: Tensor, state: TensorDictBase) -> bool:
         """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
-        return compilable(observation, state)
+        return self.judge.reckoning.kinematics.way is None and compilable(observation, state)
 
     def __call__(self, observation: Tensor, boxes: Boxes, ego: Tensor) -> Weighed:
         """What the filter makes of observations that it `fits`, differentiable once in them and in the boxes.

@@ -10,8 +10,9 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from cavbench.driving.features import ActionType, DrivingFacts
+from cavbench.driving.intervals.bends import BentReckoning
 from cavbench.driving.intervals.boxes import Assumed, Boxes
-from cavbench.driving.intervals.ego import DeadReckoning, Ego, Step
+from cavbench.driving.intervals.ego import DeadReckoning, Step
 from cavbench.driving.policy import Passed, Policy, State
 from cavbench.driving.threat import Norm
 from cavbench.errors import UserError
@@ -44,6 +45,11 @@ class IntervalPolicy(Policy):
         self.period = 1 / facts.decision_hz
         self.reckoning = reckoning(facts, action_type)
 
+    def boxes(self, observation: Tensor, state: State) -> Boxes:
+        """What is known about every row of an observation [..., V, F]."""
+        assert state is not None
+        return self.reckoning.boxes(self.assumed, observation, state["ego"])
+
     @abstractmethod
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         """The scores, as in `scores`, for given boxes."""
@@ -58,24 +64,25 @@ class IntervalPolicy(Policy):
 
     def answered(self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, state: State) -> Tensor:
         """The scores, as in `scores`, with the boxes of a set and of an estimator's tracks (`Assumed.boxes`)."""
-        return self.weighed(observation, assumed.boxes(observation, tracks), state)
+        assert state is not None
+        return self.weighed(observation, self.reckoning.boxes(assumed, observation, state["ego"], tracks), state)
 
     def filtered(self, observation: Tensor, boxes: Boxes, state: State) -> Passed:
         """As `passed`, for given boxes."""
         return Passed(observation)
 
     def passed(self, observation: Tensor, state: State = None) -> Passed:
-        return self.filtered(observation, self.assumed.boxes(observation), state)
+        return self.filtered(observation, self.boxes(observation, state), state)
 
     def assured(self, observation: Tensor, state: State) -> Tensor | None:
-        return self.safe(self.assumed.boxes(observation), state)
+        return self.safe(self.boxes(observation, state), state)
 
     def scores(self, observation: Tensor, state: State = None) -> Tensor:
         return self.answered(observation, self.assumed, None, state)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         assert state is not None
-        boxes = self.assumed.boxes(observation)
+        boxes = self.boxes(observation, state)
         return self.moved(observation, boxes, self.reckoning.step(boxes, state["ego"], action), action, state)
 
 
@@ -86,22 +93,18 @@ def reckoning(facts: DrivingFacts, action_type: ActionType) -> DeadReckoning:
         UserError: if the world does not offer what it needs.
     """
     if facts.kinematics is None:
-        raise UserError("intervals need the kinematics of cars on straight parallel lanes: this world declares none")
+        raise UserError("intervals need the kinematics of cars on parallel lanes: this world declares none")
     if facts.features.names != FEATURES:
         raise UserError(
             f"intervals need the features {', '.join(FEATURES)}, the world measures {', '.join(facts.features.names)}"
         )
     if action_type == "discrete" and not set(DECISIONS) <= set(facts.actions):
         raise UserError(f"intervals need the actions {', '.join(DECISIONS)}, the world has {', '.join(facts.actions)}")
-    return DeadReckoning(facts.kinematics, 1 / facts.decision_hz, facts.actions, action_type)
-
-
-def corrected(observation: Tensor, ego: Ego, assumed: Assumed) -> Tensor:
-    """The observation [..., V, F] with the reckoned y, vx and vy in the ego's row."""
-    along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
-    own = assumed.normalised(torch.stack([torch.zeros_like(along), ego.y, along, across], -1))[..., 1:]
-    row = torch.cat((observation[..., :1, :2], own.unsqueeze(-2)), -1)
-    return torch.cat((row, observation[..., 1:, :]), -2)
+    if facts.kinematics.way is None:
+        return DeadReckoning(facts.kinematics, 1 / facts.decision_hz, facts.actions, action_type)
+    if action_type == "continuous":
+        raise UserError("intervals of continuous actions need straight parallel lanes: on this world's road they bend")
+    return BentReckoning(facts.kinematics, 1 / facts.decision_hz, facts.actions, action_type)
 
 
 def with_inner(own: Mapping[str, Tensor | TensorDictBase], inner: State, shape: torch.Size) -> TensorDict:

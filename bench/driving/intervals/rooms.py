@@ -12,9 +12,11 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from cavbench.driving.intervals import kernels
+from cavbench.driving.intervals.bends import paths
 from cavbench.driving.intervals.boxes import Boxes, flat, shaped
 from cavbench.driving.intervals.ego import DeadReckoning, Ego
 from cavbench.driving.intervals.following import FollowingDistance
+from cavbench.driving.kinematics import Kinematics
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +51,10 @@ class Cars(NamedTuple):
         return torch.where(self.present, self.low[..., 1] / lane_width, 0.0).amax(-1).round()
 
 
-def cars_of(ego: Ego, boxes: Boxes) -> Cars:
+def cars_of(ego: Ego, boxes: Boxes, car: Kinematics | None = None) -> Cars:
+    """The other cars of boxes; if the lanes bend, which the kinematics say, as on a straight road."""
+    if car is not None and car.way is not None:
+        return Cars(boxes.present[..., 1:], *paths(ego, boxes, car))
     along, across = ego.speed * ego.heading.cos(), ego.speed * ego.heading.sin()
     own = torch.stack([torch.zeros_like(along), ego.y, along, across], -1).unsqueeze(-2)
     return Cars(boxes.present[..., 1:], boxes.low[..., 1:, :] + own, boxes.high[..., 1:, :] + own)

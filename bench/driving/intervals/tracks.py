@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from torch import Tensor
 
-from cavbench.driving.intervals import motion_kernels
+from cavbench.driving.intervals import bends, motion_kernels
 from cavbench.driving.intervals.boxes import Boxes, flat, shaped
 from cavbench.driving.intervals.ego import Ego, stacked
 from cavbench.driving.kinematics import Kinematics
@@ -30,6 +30,8 @@ def predicted(boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, period:
         car: kinematics of the world's cars.
         period: seconds per decision.
     """
+    if car.way is not None:
+        return bends.predicted(boxes, before, after, car, _limits(car, period))
     low, high = flat(boxes.low, 2), flat(boxes.high, 2)
     tracks = np.empty((len(low), low.shape[1] - 1, 1 + 2 * low.shape[2]), np.float32)
     motion_kernels.later(

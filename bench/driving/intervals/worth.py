@@ -38,7 +38,7 @@ class Worth:
 
     def fits(self, observation: Tensor, state: TensorDictBase) -> bool:
         """Whether it can answer about observations [..., V, F] with the state of as many episodes."""
-        return compilable(observation, state)
+        return self.judge.reckoning.kinematics.way is None and compilable(observation, state)
 
     def __call__(self, boxes: Boxes, ego: Tensor) -> tuple[Tensor, Tensor]:
         """The scores [..., A], differentiable once in the boxes, and whether any action is safe, bool [...].

@@ -92,7 +92,7 @@ class IntervalPlanner(IntervalPolicy):
         if self.compiled.fits(observation, state):
             return self.compiled(boxes, state["ego"])[0]
         ego = self.reckoning.now(boxes, state["ego"])
-        cars = cars_of(ego, boxes)
+        cars = cars_of(ego, boxes, self.reckoning.kinematics)
         found = self.judge(ego, cars)
         left, own, right = self._worth(ego, self.judge.rooms.speeds(ego, cars)).unbind(-1)
         order = torch.tensor(ORDER).to(own)
@@ -109,7 +109,7 @@ class IntervalPlanner(IntervalPolicy):
         if self.compiled.fits(boxes.low, state):
             return self.compiled(boxes, state["ego"])[1]
         ego = self.reckoning.now(boxes, state["ego"])
-        return self.judge(ego, cars_of(ego, boxes)).safe
+        return self.judge(ego, cars_of(ego, boxes, self.reckoning.kinematics)).safe
 
     def moved(self, observation: Tensor, boxes: Boxes, step: Step, action: Tensor, state: State) -> State:
         assert state is not None

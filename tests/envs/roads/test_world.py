@@ -152,7 +152,7 @@ def test_facts_name_the_lanes_of_a_cell_and_records_do_not_hold_them(kind: type[
     assert "lanes" not in facts.written()
 
 
-@pytest.mark.parametrize("name", ["roundabout", "intersection", "u_turn", "racetrack"])
+@pytest.mark.parametrize("name", ["roundabout", "intersection", "racetrack"])
 def test_what_needs_parallel_lanes_is_refused_in_one_line(bench: Bench, name: str) -> None:
     for words in ("defense=shield", "victim=planner"):
         said = bench("run", f"world={name}", words, "episodes=1", "attack=none")
