@@ -116,15 +116,13 @@ def distance_to(lane: LaneRecord, x: float, y: float) -> float:
 def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least: float) -> tuple[float, float, float]:
     """AbstractLane.distance_with_heading: distance in m plus angle in rad, then the local coordinates.
 
-    The distance is inf if it is surely larger than `least`; that is found without trigonometry and roots.
+    The distance is inf if it is surely larger than `least`; that is found without trigonometry.
     """
     if lane.kind == CIRCULAR:
         off_x, off_y = x - lane.center_x, y - lane.center_y
-        square = off_x * off_x + off_y * off_y
-        inside, outside = lane.radius - least - SURELY, lane.radius + least + SURELY
-        if square > outside * outside or (inside > 0.0 and square < inside * inside):
+        across = lane.turn * (lane.radius - math.sqrt(off_x * off_x + off_y * off_y))
+        if abs(across) > least + SURELY:
             return np.inf, 0.0, 0.0
-        across = lane.turn * (lane.radius - math.sqrt(square))
         angle = lane.start_phase + wrap_to_pi(math.atan2(off_y, off_x) - lane.start_phase)
         along = lane.turn * (angle - lane.start_phase) * lane.radius
     else:

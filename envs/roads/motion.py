@@ -19,7 +19,6 @@ from cavbench.envs.highway.dynamics import (
     not_zero,
 )
 from cavbench.envs.highway.ego import FASTER, LANE_LEFT, LANE_RIGHT, SLOWER, nearest_target_speed
-from cavbench.envs.roads.angles import steered
 from cavbench.envs.roads.lanes import (
     coordinates_on,
     distance_to,
@@ -99,10 +98,7 @@ def follow_road(road: Road, body: Body) -> None:
 
 @borrowing
 def steering_control(road: Road, body: Body, lane: int) -> float:
-    """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of a lane.
-
-    The slip angle is stored with it, for the next move.
-    """
+    """ControlledVehicle.steering_control: the steering angle in rad that leads to the centre of a lane."""
     along, across = coordinates_on(road, body, lane)
     ahead = heading_at(road.lanes[lane], along + body.speed * PURSUIT)
     if across == 0.0 and ahead == body.heading:
@@ -112,13 +108,12 @@ def steering_control(road: Road, body: Body, lane: int) -> float:
     command = math.asin(share) if abs(share) < SURELY_STEEP else math.copysign(1.0, share)
     heading_reference = ahead + clip(command, -MAX_LANE_CHANGE_HEADING, MAX_LANE_CHANGE_HEADING)
     heading_rate = GAIN_HEADING * wrap_to_pi(heading_reference - body.heading)
-    sine = 5.0 / 2 / speed * heading_rate
-    if sine == 0.0:
-        return sine
-    if abs(sine) > SURELY_FULL:
-        return math.copysign(MAX_STEERING, sine)
-    body.slip_steering, body.slip, body.sin_slip = steered(sine)
-    return clip(body.slip_steering, -MAX_STEERING, MAX_STEERING)
+    slip = 5.0 / 2 / speed * heading_rate
+    if slip == 0.0:
+        return slip
+    if abs(slip) > SURELY_FULL:
+        return math.copysign(MAX_STEERING, slip)
+    return clip(math.atan(2 * math.tan(math.asin(slip))), -MAX_STEERING, MAX_STEERING)
 
 
 @borrowing
@@ -172,12 +167,10 @@ def move(road: Road, body: Body, dt: float) -> None:
         body.x += speed * body.cos_heading * dt
         body.y += speed * body.sin_heading * dt
     else:
-        if body.steering != body.slip_steering:
-            body.slip_steering, body.slip = body.steering, math.atan(0.5 * math.tan(body.steering))
-            body.sin_slip = math.sin(body.slip)
-        body.x += speed * math.cos(body.heading + body.slip) * dt
-        body.y += speed * math.sin(body.heading + body.slip) * dt
-        body.heading += speed * body.sin_slip / (5.0 / 2) * dt
+        slip = math.atan(0.5 * math.tan(body.steering))
+        body.x += speed * math.cos(body.heading + slip) * dt
+        body.y += speed * math.sin(body.heading + slip) * dt
+        body.heading += speed * math.sin(slip) / (5.0 / 2) * dt
         update_direction(body)
     if body.impact:
         body.x += body.impact_x

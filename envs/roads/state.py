@@ -81,9 +81,6 @@ class Body:
     target_lane: int
     target_speed: float  # m/s
     steering: float  # rad
-    slip_steering: float  # rad, a steering angle whose slip angle is stored
-    slip: float  # rad, the direction of the motion minus the heading
-    sin_slip: float
     acceleration: float  # m/s2
     timer: float  # s since a lane change was last considered
     delta: float  # exponent of the IDM
