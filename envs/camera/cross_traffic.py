@@ -32,6 +32,9 @@ STREAM = 20
 LANES = (0.75 * CROSSING[0] + 0.25 * CROSSING[1], 0.25 * CROSSING[0] + 0.75 * CROSSING[1])
 """y of the middles of the lanes: the near one carries the traffic from the left, the far one that from the right."""
 LANE_M = (CROSSING[1] - CROSSING[0]) / 2
+EXPECTED_DECELERATION = 4.5
+"""Deceleration in m/s2 with which a car is expected to stop at most: more is what drivers ask for before something unexpected (AASHTO, A
+Policy on Geometric Design of Highways and Streets, on stopping sight distance)."""
 STANDSTILL_M = 2.0
 """Distance that a vehicle keeps when it stands: the jam distance of Treiber et al. (2000)."""
 LEAST_M = 1e-3
@@ -103,8 +106,8 @@ class CrossTraffic:
     def moved(self, car: Motion, size: tuple[float, float], brakes: Brakes, reaction_s: float, seconds: float) -> CrossTraffic:
         """The traffic after a short time.
 
-        A vehicle becomes aware of the car when the car is in its lane or can no longer stop comfortably before it, unless the vehicle is
-        at the car's way already or leaves it before the car arrives. It becomes aware of the brake lamps of the vehicle before it. A reaction
+        A vehicle becomes aware of the car when the car is in its lane or can no longer be expected to stop before it, unless the vehicle
+        is at the car's way already or leaves it before the car arrives. It becomes aware of the brake lamps of the vehicle before it. A reaction
         time later it brakes as the driver of the car does (`cavbench.detection.driver`): it begins when it must brake
         comfortably or harder to stand `STANDSTILL_M` before the car's way, or behind the place where the vehicle before it will
         stand. It does not drive on.
@@ -120,7 +123,7 @@ class CrossTraffic:
         motion, half = self.motion, self.half[..., 0]
         rear, front = motion.distance + half, motion.distance - half
         begins, ends = self.y - LANE_M / 2, self.y + LANE_M / 2
-        at, stops = -car.distance[:, None], car.speed.square()[:, None] / (2 * COMFORTABLE_DECELERATION)
+        at, stops = -car.distance[:, None], car.speed.square()[:, None] / (2 * EXPECTED_DECELERATION)
         takes = (at + stops > begins) & (at - length < ends)
         arrives = (begins - at).clamp(min=0) / car.speed[:, None].clamp(min=LEAST_M)
         leaves = (rear + across / 2) / motion.speed.clamp(min=LEAST_M)
