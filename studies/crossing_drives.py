@@ -41,7 +41,9 @@ def main() -> None:
     header_shown = False
     for victim in asked.victims:
         for defense in asked.defenses:
-            inner = registry.load("defense", defense)().load(registry.load("victim", victim)(), 0, StopSignCrossing().facts)
+            inner = registry.load("defense", defense)().load(
+                registry.load("victim", victim)(), 0, StopSignCrossing().facts
+            )
             for attack in asked.attacks:
                 texels = _texels(attack, inner, asked.budget)
                 for weather in asked.weathers:
@@ -56,7 +58,9 @@ def main() -> None:
                                 if not header_shown:
                                     print(f"{'':<60}" + "".join(f"{name:>18}" for name in found))
                                     header_shown = True
-                                title = f"{victim} {defense}, {attack}, {weather}, {lens}, {speed:g} m/s, {reaction:g} s"
+                                title = (
+                                    f"{victim} {defense}, {attack}, {weather}, {lens}, {speed:g} m/s, {reaction:g} s"
+                                )
                                 means = "".join(f"{float(values.mean()):>18.2f}" for values in found.values())
                                 print(f"{title:<60}{means}", flush=True)
 

@@ -50,7 +50,7 @@ class DrivingEnv(EnvBase):
 
     Args:
         step_s: time of a step in s.
-        sign_px_m: width of a stop sign in the image times its distance, in pixels times m: the focal length times the sign's width.
+        sign_px_m: width of a stop sign in the image times its distance, in pixels times m: focal length times the sign's width.
         plan: the road from above.
     """
 
@@ -158,8 +158,8 @@ class Drives:
 def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Drive:
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
-    Each new frame is shown to the detector, with the distance driven since the one before. The stop signs that it detects go to the
-    driver (`cavbench.detection.driver`), and the deceleration that the driver asks for goes to the car.
+    Each new frame is shown to the detector, with the distance driven since the one before. The stop signs that it detects go to
+    the driver (`cavbench.detection.driver`), and the deceleration that the driver asks for goes to the car.
 
     Args:
         detector: the (defended) victim.

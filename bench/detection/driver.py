@@ -1,7 +1,7 @@
-"""A driver with a memory: it follows what is detected from frame to frame, confirms what holds together, and brakes to stop there.
+"""A driver with a memory: it follows detections from frame to frame, confirms what holds together, and brakes to stop there.
 
-The closed-loop form of `cavbench.detection.stopping`, with the same constants. The driver does not know where a sign can be: a false
-detection that holds together stops the car as the sign does.
+The closed-loop form of `cavbench.detection.stopping`, with the same constants. The driver does not know where a sign can be: a
+false detection that holds together stops the car as the sign does.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Track:
 
     Args:
         box: [4], where it was last detected, in pixels.
-        lines_m: of the last five frames, oldest first: what the car will have driven when it is at the line of this sign, in m, by the
-            width of the box; NaN where it was not detected.
+        lines_m: of the last five frames, oldest first: what the car will have driven when it is at the line of this sign, in m,
+            by the width of the box; NaN where it was not detected.
         line_m: the middle of these; the last one of a track that was lost.
         since_s: time since it was confirmed; NaN until then. A confirmed sign is not forgotten.
     """
@@ -88,8 +88,9 @@ class Memory:
     def seeing(self, boxes: Tensor, frame: int, driven_m: float) -> Memory:
         """The memory after a look.
 
-        A box continues the track whose last box it overlaps most, by an IoU of at least `SAME_IOU`, as in the tracker of Bochinski et
-        al. (2017), but a track bridges up to four frames. Other boxes begin tracks. Three detections in five frames confirm one.
+        A box continues the track whose last box it overlaps most, by an IoU of at least `SAME_IOU`, as in the tracker of
+        Bochinski et al. (2017, "High-speed tracking-by-detection without using image information"), but a track bridges up to
+        four frames. Other boxes begin tracks. Three detections in five frames confirm one.
 
         Args:
             boxes: [M, 4], the detected stop signs, best first, in pixels.
@@ -127,9 +128,9 @@ class Memory:
     def deciding(self, driven_m: float, speed_mps: float) -> tuple[float, Memory]:
         """The deceleration in m/s2 that the driver asks for, and its memory with that decision.
 
-        The nearest of the confirmed signs counts for which the reaction time has passed. The driver begins to brake when it must brake
-        comfortably or harder to stop at the line of this sign. From then on it asks for the deceleration that stops the car there, at
-        least a comfortable one. The brakes limit it.
+        The nearest of the confirmed signs counts for which the reaction time has passed. The driver begins to brake when it must
+        brake comfortably or harder to stop at the line of this sign. From then on it asks for the deceleration that stops the car
+        there, at least a comfortable one. The brakes limit it.
 
         Args:
             driven_m: what the car has driven so far, in m.

@@ -24,7 +24,7 @@ FRAME = CLOSED_LOOP_DISTANCES.index(18.0)
 
 
 def world() -> Figure:
-    """A frame in each weather, clean and through drops, and speed over distance for signs that are confirmed at different distances."""
+    """A frame in each weather, clean and through drops, and speed over distance for four distances of confirmation."""
     made = style.figure(6.0, "crossing: the car stops where its brakes stop it")
     upper, lower = made.subfigures(2, height_ratios=(4, 5))
     weathers, lenses = [str(weather) for weather in AXES["weather"].choices], ("clean", "drops")

@@ -33,8 +33,8 @@ LANES = (0.75 * CROSSING[0] + 0.25 * CROSSING[1], 0.25 * CROSSING[0] + 0.75 * CR
 """y of the middles of the lanes: the near one carries the traffic from the left, the far one that from the right."""
 LANE_M = (CROSSING[1] - CROSSING[0]) / 2
 EXPECTED_DECELERATION = 4.5
-"""Deceleration in m/s2 with which a car is expected to stop at most: more is what drivers ask for before something unexpected (AASHTO, A
-Policy on Geometric Design of Highways and Streets, on stopping sight distance)."""
+"""A car that must brake harder than this in m/s2 is not expected to stop: most drivers do so for something unexpected only
+(AASHTO, A Policy on Geometric Design of Highways and Streets, on stopping sight distance)."""
 STANDSTILL_M = 2.0
 """Distance that a vehicle keeps when it stands: the jam distance of Treiber et al. (2000)."""
 LEAST_M = 1e-3
@@ -103,14 +103,16 @@ class CrossTraffic:
             torch.where(each, self.braked_s, other.braked_s),
         )
 
-    def moved(self, car: Motion, size: tuple[float, float], brakes: Brakes, reaction_s: float, seconds: float) -> CrossTraffic:
+    def moved(
+        self, car: Motion, size: tuple[float, float], brakes: Brakes, reaction_s: float, seconds: float
+    ) -> CrossTraffic:
         """The traffic after a short time.
 
-        A vehicle becomes aware of the car when the car is in its lane or can no longer be expected to stop before it, unless the vehicle
-        is at the car's way already or leaves it before the car arrives. It becomes aware of the brake lamps of the vehicle before it. A reaction
-        time later it brakes as the driver of the car does (`cavbench.detection.driver`): it begins when it must brake
-        comfortably or harder to stand `STANDSTILL_M` before the car's way, or behind the place where the vehicle before it will
-        stand. It does not drive on.
+        A vehicle becomes aware of the car when the car is in its lane or must brake harder than `EXPECTED_DECELERATION` to stop
+        before it, unless the vehicle is at the car's way already or leaves it before the car arrives. It becomes aware of the
+        brake lamps of the vehicle before it, too. A reaction time later it brakes as the driver of the car does
+        (`cavbench.detection.driver`): it begins when it must brake comfortably or harder to stand `STANDSTILL_M` before the car's
+        way, or behind the place where the vehicle before it will stand. It does not drive on.
 
         Args:
             car: the motion of the cars, [B] each.

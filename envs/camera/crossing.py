@@ -1,4 +1,4 @@
-"""The crossing as a component: one road with a frame every half metre or metre, on which a detector drives a car in closed loop."""
+"""The crossing as a component: one road with frames close together, on which a detector drives a car in closed loop."""
 
 from __future__ import annotations
 
@@ -38,8 +38,8 @@ class StopSignCrossing(BankWorld):
 
     Args:
         bank: folder of the rendered frames; empty for the shipped frames.
-        reaction: time after which the cross traffic brakes for a car that does not stop, in s, from 0 to 100. An episode is over before
-            20: then nobody reacts.
+        reaction: time after which the cross traffic brakes for a car that does not stop, in s, from 0 to 100. Beyond 20 nobody
+            reacts, because an episode is over before.
     """
 
     title: ClassVar[str] = "crossing"

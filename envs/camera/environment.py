@@ -37,8 +37,8 @@ class ApproachEnv(DrivingEnv):
 
     `info` has `distance` (from the front of the car to the line in m, negative beyond it), `speed` in m/s, `frame` (number of the
     frame), the `box` of the sign in pixels [B, 4], its `visible` share, `others`, the rectangles of the cross traffic in m
-    [B, K, N, 4], `hit`, whether the car has collided with one of them while it moved [B, K], and `braked`, whether one of them has
-    braked [B, K].
+    [B, K, N, 4], `hit`, whether the car has collided with one of them while it moved [B, K], and `braked`, whether one of them
+    has braked [B, K].
 
     Args:
         scenes: frames of each approach, farthest first, all of one size and at the same distances.

@@ -36,7 +36,9 @@ class GrowingScenes(Scenes):
         self.decoys = ()
 
     def render(self, frames: Tensor, patches: Tensor | None, share: float) -> Tensor:
-        return torch.stack([self._picture(int(frame), None if patches is None else patches[0], share) for frame in frames])
+        return torch.stack(
+            [self._picture(int(frame), None if patches is None else patches[0], share) for frame in frames]
+        )
 
     def _picture(self, frame: int, patch: Tensor | None, share: float) -> Tensor:
         picture = torch.zeros(3, *self.size)

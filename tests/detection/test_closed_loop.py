@@ -87,7 +87,9 @@ def test_the_collision_test_is_symmetric_and_that_of_shared_area(a: Tensor, b: T
 
 def test_a_patch_that_hides_the_sign_sends_the_car_into_the_crossing() -> None:
     scenes, seeds = GrowingScenes(DISTANCES), range(200)
-    clean, patched = (drive(SquareDetector(), ApproachEnv([scenes], patch, 0.75, seeds=seeds)) for patch in (None, CYAN))
+    clean, patched = (
+        drive(SquareDetector(), ApproachEnv([scenes], patch, 0.75, seeds=seeds)) for patch in (None, CYAN)
+    )
     assert clean.stopped
     assert not clean.collided.any()
     assert not patched.confirmed_m

@@ -22,7 +22,7 @@ CAMERA = 760
 """Width of the camera's image in the film, in pixels."""
 INSET, MARGIN = 110, 1.0
 """Side of the enlarged sign in pixels, and the space around the sign as a share of its width."""
-BEHIND_M, BEYOND_M, SCALE = 62.0, 16.0, 6.5
+BEHIND_M, BEYOND_M, SCALE = 66.0, 16.0, 6.5
 """Metres of road before and beyond the line that are seen from above, and pixels a metre; the car drives to the right."""
 HEADER, TITLE, GAP = 36, 28, 8
 

@@ -121,7 +121,8 @@ def test_the_environment_knows_how_wide_a_sign_is() -> None:
 def test_lenses_are_those_of_the_windscreen() -> None:
     """Clean frames are the street's, bit for bit; drops and blur change them."""
     scenes = {
-        lens: WORLD.approaches(AXES.cell(weather="rain", lens=lens), range(1))[0].scenes for lens in ("clean", "drops", "blur")
+        lens: WORLD.approaches(AXES.cell(weather="rain", lens=lens), range(1))[0].scenes
+        for lens in ("clean", "drops", "blur")
     }
     frames = torch.tensor([40])
     shown = {lens: one.render(frames, None, 0.5) for lens, one in scenes.items()}
@@ -144,7 +145,7 @@ def test_traffic_that_does_not_react_is_hit_more_often() -> None:
 
 @pytest.mark.parametrize("reaction", [-1.0, 101.0, float("nan")])
 def test_impossible_reaction_times_are_refused_in_one_line(reaction: float) -> None:
-    with pytest.raises(ValueError, match="crossing.reaction must be from 0 to 100 s, got"):
+    with pytest.raises(ValueError, match=r"crossing\.reaction must be from 0 to 100 s, got"):
         StopSignCrossing(reaction=reaction)
 
 
