@@ -184,7 +184,9 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
         if sight is None or frame != memory.frame:
             moved, looked_at = looked_at - info["distance"][:, 0], info["distance"][:, 0]
             sight, remembered = glance(detector, now["observation"], info["box"], moved, remembered)
-            known, memory = len(memory.confirmed), memory.seeing(sight.found[0].boxes, frame, driven)
+            known = len(memory.confirmed)
+            # The image is of the nearest frame, not of the place of the car.
+            memory = memory.seeing(sight.found[0].boxes, frame, start_m - float(info["shown"]))
             if distance > 0 and len(memory.confirmed) > known:
                 for track in memory.confirmed:
                     is_sign = float(overlap(track.box, info["box"][0])) >= SAME_IOU

@@ -95,7 +95,7 @@ class Memory:
         Args:
             boxes: [M, 4], the detected stop signs, best first, in pixels.
             frame: number of the frame that is seen.
-            driven_m: what the car has driven so far, in m.
+            driven_m: what the car had driven where the image was taken, in m.
         """
         if frame == self.frame:
             return self

@@ -36,9 +36,9 @@ class ApproachEnv(DrivingEnv):
     else 0.
 
     `info` has `distance` (from the front of the car to the line in m, negative beyond it), `speed` in m/s, `frame` (number of the
-    frame), the `box` of the sign in pixels [B, 4], its `visible` share, `others`, the rectangles of the cross traffic in m
-    [B, K, N, 4], `hit`, whether the car has collided with one of them while it moved [B, K], and `braked`, whether one of them
-    has braked [B, K].
+    frame), `shown` (its distance to the sign in m), the `box` of the sign in pixels [B, 4], and its `visible` share. It also has
+    `others`, the rectangles of the cross traffic in m [B, K, N, 4], `hit`, whether the car has collided with one of them while it
+    moved [B, K], and `braked`, whether one of them has braked [B, K].
 
     Args:
         scenes: frames of each approach, farthest first, all of one size and at the same distances.
@@ -83,6 +83,7 @@ class ApproachEnv(DrivingEnv):
             distance=number,
             speed=number.clone(),
             frame=Categorical(len(self.distances), shape=(batch, 1), dtype=torch.int64),
+            shown=number.clone(),
             box=Unbounded(shape=(batch, 4), dtype=torch.float32),
             visible=Bounded(0, 1, shape=(batch, 1), dtype=torch.float32),
             others=Unbounded(shape=(*self.traffic.motion.speed.shape, 4), dtype=torch.float32),
@@ -145,6 +146,7 @@ class ApproachEnv(DrivingEnv):
             "distance": self.motion.distance[:, None].clone(),
             "speed": self.motion.speed[:, None].clone(),
             "frame": frames[:, None],
+            "shown": self.distances[frames][:, None],
             "box": torch.stack(boxes),
             "visible": torch.stack(visible),
             "others": self.traffic.rectangles(),

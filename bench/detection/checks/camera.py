@@ -160,7 +160,7 @@ class CameraSuite(Suite):
             return "none"
         require(tuple(env.batch_size) == (1,), f"its environment has {list(env.batch_size)} cars, not one")
         now = env.reset()
-        missing = {"distance", "speed", "frame", "box", "others", "hit", "braked"} - set(now["info"].keys())
+        missing = {"distance", "speed", "frame", "shown", "box", "others", "hit", "braked"} - set(now["info"].keys())
         require(not missing, f"the info of its environment lacks {', '.join(sorted(missing))}")
         for name in ("hit", "braked"):
             shape = tuple(now["info", name].shape)
