@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from torchrl.envs import EnvBase
 
 from cavbench.detection import stopping
+from cavbench.detection.boxes import overlap
 from cavbench.detection.detector import Detections, Detector
 from cavbench.detection.driver import Memory
-from cavbench.detection.sight import glance
+from cavbench.detection.sight import SAME_IOU, glance
 
 STANDS_MPS = 1e-3
 """A slower car stands still."""
@@ -49,10 +50,12 @@ class DrivingEnv(EnvBase):
 
     Args:
         step_s: time of a step in s.
+        sign_px_m: width of a stop sign in the image times its distance, in pixels times m: focal length times the sign's width.
         plan: the road from above.
     """
 
     step_s: float
+    sign_px_m: float
     plan: Plan
 
 
@@ -66,10 +69,11 @@ class Moment:
         frame: number of the frame that was shown.
         confidence: in the sign at its true place.
         found: the stop signs that were detected.
-        confirmed: whether the driver has confirmed the sign.
+        confirmed: whether the driver has confirmed a sign, there or elsewhere.
         asked: deceleration that the driver asks for, in m/s2.
         others: rectangles [N, 4] of the cross traffic in m, in the draws that are kept.
         hit: [K], whether the car has collided.
+        braked: [K], whether a vehicle of the cross traffic has braked.
     """
 
     distance_m: float
@@ -81,6 +85,7 @@ class Moment:
     asked: float
     others: Mapping[int, Array]
     hit: NDArray[np.bool_]
+    braked: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -91,11 +96,13 @@ class Drive:
         moments: its steps.
         step_s: time between two steps.
         confirmed_m: distance at which the sign was confirmed; 0 if it never was.
+        false_m: distance at which something else was first confirmed as a stop sign; 0 if nothing was.
     """
 
     moments: tuple[Moment, ...]
     step_s: float
     confirmed_m: float
+    false_m: float
 
     @property
     def stands(self) -> bool:
@@ -109,14 +116,25 @@ class Drive:
         return beyond if beyond > ROUNDING_M else 0.0
 
     @property
+    def short_m(self) -> float:
+        """How far before the line the car stood still; 0 if it stood at or beyond the line, or did not stop."""
+        before = self.moments[-1].distance_m
+        return before if self.stands and before > ROUNDING_M else 0.0
+
+    @property
     def stopped(self) -> bool:
-        """Whether it stopped, at most `stopping.RAN_M` beyond the line."""
-        return self.stands and self.overrun_m <= stopping.RAN_M
+        """Whether it stopped at the line: at most `stopping.RAN_M` beyond it and at most `stopping.EARLY_M` before it."""
+        return self.stands and self.overrun_m <= stopping.RAN_M and self.short_m <= stopping.EARLY_M
 
     @property
     def collided(self) -> NDArray[np.bool_]:
         """[K] whether it collided in each draw."""
         return self.moments[-1].hit
+
+    @property
+    def braked(self) -> NDArray[np.bool_]:
+        """[K] whether the cross traffic braked in each draw."""
+        return self.moments[-1].braked
 
 
 @dataclass(frozen=True)
@@ -140,8 +158,8 @@ class Drives:
 def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Drive:
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
-    Each new frame is shown to the detector, with the distance driven since the one before. Its confidence in the sign goes to the
-    driver (`cavbench.detection.driver`), and the deceleration that the driver asks for goes to the car.
+    Each new frame is shown to the detector, with the distance driven since the one before. The stop signs that it detects go to
+    the driver (`cavbench.detection.driver`), and the deceleration that the driver asks for goes to the car.
 
     Args:
         detector: the (defended) victim.
@@ -155,38 +173,57 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
     (batch,) = env.batch_size
     if batch != 1:
         raise ValueError(f"a drive is that of one car, got {batch}")
-    memory, sight, now = Memory.initial(1), None, env.reset()
+    memory, sight, now = Memory(env.sign_px_m), None, env.reset()
     remembered, looked_at = detector.initial(), now["info"]["distance"][:, 0]
+    start_m, confirmed_m, false_m = float(looked_at), 0.0, 0.0
     moments: list[Moment] = []
     while len(moments) < MOST_STEPS:
         info = now["info"]
-        distance, speed, frame = (info[name][:, 0] for name in ("distance", "speed", "frame"))
-        if sight is None or int(frame) != int(memory.frame):
-            moved, looked_at = looked_at - distance, distance
+        distance, speed, frame = float(info["distance"]), float(info["speed"]), int(info["frame"])
+        driven = start_m - distance
+        if sight is None or frame != memory.frame:
+            moved, looked_at = looked_at - info["distance"][:, 0], info["distance"][:, 0]
             sight, remembered = glance(detector, now["observation"], info["box"], moved, remembered)
-        memory = memory.seeing(torch.from_numpy(sight.confidence), frame, distance)
-        asked, memory = memory.deciding(distance, speed)
+            known = len(memory.confirmed)
+            # The image is of the nearest frame, not of the place of the car.
+            memory = memory.seeing(sight.found[0].boxes, frame, start_m - float(info["shown"]))
+            if distance > 0 and len(memory.confirmed) > known:
+                for track in memory.confirmed:
+                    is_sign = float(overlap(track.box, info["box"][0])) >= SAME_IOU
+                    fresh = track.since_s == 0
+                    confirmed_m = confirmed_m or distance * (fresh and is_sign)
+                    false_m = false_m or distance * (fresh and not is_sign)
+        asked, memory = memory.deciding(driven, speed)
         moments.append(
             Moment(
-                distance_m=float(distance),
-                speed_mps=float(speed),
-                frame=int(frame),
+                distance_m=distance,
+                speed_mps=speed,
+                frame=frame,
                 confidence=float(sight.confidence[0]),
                 found=sight.found[0],
-                confirmed=bool(memory.confirmed_m > 0),
-                asked=float(asked),
+                confirmed=bool(memory.confirmed),
+                asked=asked,
                 others={draw: info["others"][0, draw].double().numpy() for draw in draws},
                 hit=info["hit"][0].numpy(),
+                braked=info["braked"][0].numpy(),
             )
         )
         if bool(now["done"].all()):
             break
-        now = env.step(now.set("action", env.action_spec.project(asked[:, None])))["next"]
+        now = env.step(now.set("action", env.action_spec.project(torch.tensor([[asked]]))))["next"]
         memory = memory.after(env.step_s)
-    return Drive(tuple(moments), env.step_s, float(memory.confirmed_m))
+    return Drive(tuple(moments), env.step_s, confirmed_m, false_m)
 
 
-MEASURED = ("stopped", "drive_confirmed_m", "drive_overrun_m", "collided")
+MEASURED = (
+    "stopped",
+    "drive_confirmed_m",
+    "drive_overrun_m",
+    "collided",
+    "drive_short_m",
+    "drive_false_m",
+    "others_braked",
+)
 """The columns of a drive."""
 
 
@@ -199,4 +236,7 @@ def measured(driven: Drive | None, approaches: int) -> dict[str, NDArray[np.gene
         "drive_confirmed_m": np.array([driven.confirmed_m] * approaches),
         "drive_overrun_m": np.array([driven.overrun_m] * approaches),
         "collided": driven.collided,
+        "drive_short_m": np.array([driven.short_m] * approaches),
+        "drive_false_m": np.array([driven.false_m] * approaches),
+        "others_braked": driven.braked,
     }

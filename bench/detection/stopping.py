@@ -26,6 +26,9 @@ COMFORTABLE_DECELERATION = 3.4
 """Smallest deceleration in m/s^2 (AASHTO, A Policy on Geometric Design of Highways and Streets)."""
 RAN_M = 1.0
 """A car that stops more than this beyond the line has run the sign, in m."""
+EARLY_M = 6.6
+"""A car that stops more than this before the line has stopped for something else, in m. From there it is 30 feet (9.1 m) to the
+crossing road: the farthest place of a stop line (MUTCD 2009, section 3B.16)."""
 
 
 def confirmed(detected: Flags) -> Flags:

@@ -191,7 +191,7 @@ CLOSED_LOOP: tuple[pa.Field, ...] = (
     field(
         "stopped",
         pa.bool_(),
-        "closed loop: whether the car stopped before the line or at most 1 m beyond it",
+        "closed loop: whether the car stopped at the line: at most 6.6 m before and at most 1 m beyond it",
         nullable=True,
     ),
     field(
@@ -218,6 +218,31 @@ CLOSED_LOOP: tuple[pa.Field, ...] = (
     ),
 )
 """What the car does that the detector drives; null in older records, and in worlds without a closed loop."""
+FALSE_STOPS: tuple[pa.Field, ...] = (
+    field(
+        "drive_short_m",
+        FLOAT,
+        "closed loop: how far before the line the car stood still; 0 if it stood at or beyond the line, or did not stop",
+        "m",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "drive_false_m",
+        FLOAT,
+        "closed loop: distance at which the driver first confirmed something else as a stop sign; 0 if never",
+        "m",
+        nullable=True,
+        low=0,
+    ),
+    field(
+        "others_braked",
+        pa.bool_(),
+        "closed loop: whether a vehicle of the cross traffic braked for the car",
+        nullable=True,
+    ),
+)
+"""Stops for something else, and what the cross traffic does; null in older records, and in worlds without a closed loop."""
 
 
 class DetectionTrack(Track):
@@ -241,8 +266,9 @@ class DetectionTrack(Track):
         NAN_GRADIENTS,
         *FACES,
         *CERTIFIED_FRAMES,
+        *FALSE_STOPS,
     )
-    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*FACES, *CERTIFIED_FRAMES))
+    later: ClassVar[tuple[str, ...]] = tuple(one.name for one in (*FACES, *CERTIFIED_FRAMES, *FALSE_STOPS))
     certificates: ClassVar[str] = "frame_certified"
     norms: ClassVar[tuple[str, ...]] = ("patch", "print")
     metric: ClassVar[str] = "stop_score"

@@ -1,14 +1,12 @@
-"""The crossing: its road in each weather, and where the car comes to stand."""
+"""The crossing: its road in each weather and through drops, and where the car comes to stand."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import torch
 from matplotlib.figure import Figure
 
 from cavbench.detection.driver import Memory
-from cavbench.detection.stopping import SPEED_MPS
+from cavbench.detection.stopping import CONFIRMED_IN, SPEED_MPS
 from cavbench.envs.camera.braking import Motion, brakes_in
 from cavbench.envs.camera.crossing import StopSignCrossing
 from cavbench.envs.camera.crossing_axes import AXES
@@ -19,21 +17,23 @@ from cavbench.envs.weather import WEATHERS
 from docs.figures import style
 from docs.figures.sightings import show
 
-STEP_S = 0.05
+STEP_S, SIGN_PX_M = 0.05, 721.0 * 1.2
 CONFIRMED_M = (29.0, 19.0, 16.0, 13.0)
-FRAME = 24
-"""The frame shown, 18 m before the sign."""
+FRAME = CLOSED_LOOP_DISTANCES.index(18.0)
+"""The frame shown."""
 
 
 def world() -> Figure:
-    """A frame in each weather, and speed over distance for signs that are confirmed at different distances."""
-    made = style.figure(5.2, "crossing: the car stops where its brakes stop it")
-    upper, lower = made.subfigures(2, height_ratios=(1, 2))
-    weathers = [str(weather) for weather in AXES["weather"].choices]
-    for axes, weather in zip(upper.subplots(1, len(weathers)), weathers, strict=True):
-        scenes = StopSignCrossing().approaches(AXES.cell(weather=weather), range(1))[0].scenes
-        show(axes, scenes.render(torch.tensor([FRAME]), None, 0.5)[0][:, :, 300:1000])
-        axes.set_title(weather, fontsize=10)
+    """A frame in each weather, clean and through drops, and speed over distance for four distances of confirmation."""
+    made = style.figure(6.0, "crossing: the car stops where its brakes stop it")
+    upper, lower = made.subfigures(2, height_ratios=(4, 5))
+    weathers, lenses = [str(weather) for weather in AXES["weather"].choices], ("clean", "drops")
+    for row, lens in zip(upper.subplots(len(lenses), len(weathers)), lenses, strict=True):
+        for axes, weather in zip(row, weathers, strict=True):
+            cell = AXES.cell(weather=weather, lens=lens)
+            scenes = StopSignCrossing().approaches(cell, range(1))[0].scenes
+            show(axes, scenes.render(torch.tensor([FRAME]), None, 0.5)[0][:, :, 300:1000])
+            axes.set_title(f"{weather}, {lens}", fontsize=10)
     axes = lower.subplots()
     colours = (style.GREEN, style.BLUE, style.ORANGE, style.RED)
     for confirmed, colour in zip(CONFIRMED_M, colours, strict=True):
@@ -50,14 +50,18 @@ def world() -> Figure:
 
 def _driven(confirmed_m: float, weather: str) -> tuple[list[float], list[float]]:
     """Distance and speed at each step of a car at 10 m/s whose driver confirms the sign at a distance."""
-    brakes, memory = brakes_in(WEATHERS[weather]), Memory.initial(1)
-    motion = Motion(torch.tensor([CLOSED_LOOP_DISTANCES[0]]), torch.tensor([SPEED_MPS]), torch.zeros(1))
+    brakes, memory = brakes_in(WEATHERS[weather]), Memory(SIGN_PX_M)
+    start = CLOSED_LOOP_DISTANCES[0]
+    motion = Motion(torch.tensor([start]), torch.tensor([SPEED_MPS]), torch.zeros(1))
     distances, speeds = [], []
     while float(motion.speed) > 0 and float(motion.distance) > CLEARED_M:
-        distances.append(float(motion.distance))
-        speeds.append(float(motion.speed))
-        if float(motion.distance) <= confirmed_m and not float(memory.confirmed_m):
-            memory = replace(memory, confirmed_m=motion.distance)
-        asked, memory = memory.deciding(motion.distance, motion.speed)
-        motion, memory = brakes.moved(motion, asked, STEP_S), memory.after(STEP_S)
+        distance, speed = float(motion.distance), float(motion.speed)
+        distances.append(distance)
+        speeds.append(speed)
+        # It is detected from as many frames before on as it takes to confirm it.
+        if 1 < distance <= confirmed_m + (CONFIRMED_IN - 1) * SPEED_MPS * STEP_S + 1e-3:
+            half = SIGN_PX_M / distance / 2
+            memory = memory.seeing(torch.tensor([[-half, -half, half, half]]), len(distances), start - distance)
+        asked, memory = memory.deciding(start - distance, speed)
+        motion, memory = brakes.moved(motion, torch.tensor([asked]), STEP_S), memory.after(STEP_S)
     return [*distances, float(motion.distance)], [*speeds, float(motion.speed)]

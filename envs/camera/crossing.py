@@ -1,4 +1,4 @@
-"""The crossing as a component: one road with a frame every half metre, on which a detector drives a car in closed loop."""
+"""The crossing as a component: one road with frames close together, on which a detector drives a car in closed loop."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ from torch import Tensor
 
 from cavbench.detection import Approach, Scenes
 from cavbench.detection.closed_loop import Plan
+from cavbench.detection.stopping import REACTION_S
 from cavbench.envs.camera import bank, poses
 from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.bank_world import BankWorld
 from cavbench.envs.camera.braking import brakes_in
-from cavbench.envs.camera.crossing_axes import AXES, CROSSING_V1
+from cavbench.envs.camera.crossing_axes import AXES, CROSSING_V2
 from cavbench.envs.camera.environment import CAR_M, ApproachEnv
 from cavbench.envs.camera.poses import Pose
 from cavbench.envs.camera.street import layout
 from cavbench.envs.camera.street.vehicles import footprint
+from cavbench.envs.camera.windscreen import WindscreenScenes
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.envs.weather import WEATHERS
 from cavbench.errors import UserError
@@ -36,30 +38,40 @@ class StopSignCrossing(BankWorld):
 
     Args:
         bank: folder of the rendered frames; empty for the shipped frames.
+        reaction: time after which the cross traffic brakes for a car that does not stop, in s, from 0 to 100. Beyond 20 nobody
+            reacts, because an episode is over before.
     """
 
     title: ClassVar[str] = "crossing"
     axes: ClassVar[Axes] = AXES
-    grid: ClassVar[str] = CROSSING_V1.name
+    grid: ClassVar[str] = CROSSING_V2.name
     locations: ClassVar[tuple[str, ...]] = (PLACE.name,)
     mounts: ClassVar[bool] = False
+
+    reaction: float = REACTION_S
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not 0 <= self.reaction <= 100:
+            raise ValueError(f"crossing.reaction must be from 0 to 100 s, got {self.reaction:g}")
 
     def training_scenes(self) -> Scenes:
         """Those of the world `camera`."""
         return StopSignApproach().training_scenes()
 
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
-        """All seeds of a weather have the same frames; they differ in the cross traffic."""
-        scenes = _scenes(self.folder, str(cell.weather))
+        """All seeds of a weather and a lens have the same frames; they differ in the cross traffic."""
+        scenes = _scenes(self.folder, str(cell.weather), str(cell.lens))
         return [Approach(seed=seed, location=PLACE.name, scenes=scenes) for seed in seeds]
 
     def environment(self, cell: Cell, seeds: Sequence[int], patch: Tensor | None, share: float) -> ApproachEnv:
         return ApproachEnv(
-            [_scenes(self.folder, str(cell.weather))],
+            [_scenes(self.folder, str(cell.weather), str(cell.lens))],
             None if patch is None else patch.unsqueeze(0),
             share,
             speed=float(cell.speed),
             brakes=brakes_in(WEATHERS[str(cell.weather)]),
+            reaction_s=self.reaction,
             seeds=seeds,
             plan=_plan(),
         )
@@ -69,7 +81,11 @@ class StopSignCrossing(BankWorld):
 
 
 @lru_cache(maxsize=4)
-def _scenes(folder: Path, weather: str) -> BankScenes:
+def _scenes(folder: Path, weather: str, lens: str) -> Scenes:
+    if lens != "clean":
+        street = _scenes(folder, weather, "clean")
+        assert isinstance(street, BankScenes)
+        return WindscreenScenes(street, [lens] * len(street))
     frames = bank.read(folder, PLACE.name, weather)
     if not frames:
         raise UserError(f"no frames of {PLACE.name} in {weather} in {folder}; `bench render` makes them")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from cavbench.envs.camera.windscreen_axes import LENSES
 from cavbench.scenarios import Axes, Axis, Grid
 
 AXES = Axes(
@@ -22,12 +23,19 @@ AXES = Axes(
             high=14.0,
             default=10.0,
         ),
+        Axis(
+            name="lens",
+            kind="str",
+            meaning="what is between the street and the sensor",
+            choices=LENSES,
+            default="clean",
+        ),
     )
 )
-CROSSING_V1 = Grid(
-    name="crossing-v1",
+CROSSING_V2 = Grid(
+    name="crossing-v2",
     world="crossing",
     axes=AXES,
-    values={"weather": ("clear", "rain", "fog"), "speed": (8.0, 10.0, 12.0)},
+    values={"weather": ("clear", "rain", "fog"), "speed": (8.0, 10.0, 12.0), "lens": ("clean", "drops")},
     episodes=50,
 )

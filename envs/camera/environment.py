@@ -12,7 +12,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from cavbench.detection import Scenes
 from cavbench.detection.boxes import overlap
 from cavbench.detection.closed_loop import STANDS_MPS, DrivingEnv, Plan
-from cavbench.detection.stopping import SPEED_MPS
+from cavbench.detection.stopping import REACTION_S, SPEED_MPS
 from cavbench.envs.camera.braking import Brakes, Motion
 from cavbench.envs.camera.cross_traffic import CrossTraffic
 from cavbench.envs.camera.street.layout import CROSSING
@@ -26,7 +26,7 @@ CLEARED_M = -(CROSSING[1] + CAR_M[0])
 
 
 class ApproachEnv(DrivingEnv):
-    """B cars that approach a stop sign, and brake or cross the road behind it.
+    """B cars that approach a stop sign, and brake or cross the road behind it, where the traffic brakes for them.
 
     The action is the deceleration that the driver asks for in m/s2, float32 [B, 1]. The brakes build it up
     (`cavbench.envs.camera.braking`). A car at 10 m/s drives from one frame to the next in a step. `observation` is the
@@ -36,15 +36,17 @@ class ApproachEnv(DrivingEnv):
     else 0.
 
     `info` has `distance` (from the front of the car to the line in m, negative beyond it), `speed` in m/s, `frame` (number of the
-    frame), the `box` of the sign in pixels [B, 4], its `visible` share, `others`, the rectangles of the cross traffic in m
-    [B, K, N, 4], and `hit`, whether the car has collided with one of them while it moved [B, K].
+    frame), `shown` (its distance to the sign in m), the `box` of the sign in pixels [B, 4], and its `visible` share. It also has
+    `others`, the rectangles of the cross traffic in m [B, K, N, 4], `hit`, whether the car has collided with one of them while it
+    moved [B, K], and `braked`, whether one of them has braked [B, K].
 
     Args:
         scenes: frames of each approach, farthest first, all of one size and at the same distances.
         patches: sRGB in [0, 1], [B or 1, 3, P, P]; None for no patch.
         share: side of the patch as a share of the sign's side.
         speed: speed at the first frame in m/s.
-        brakes: the brakes of the cars.
+        brakes: the brakes of the cars and of the cross traffic.
+        reaction_s: reaction time of the cross traffic in s; inf if it does not react.
         seeds: seeds of K draws of the cross traffic; without any, the crossing road is empty.
         plan: the road from above, for films.
     """
@@ -59,29 +61,34 @@ class ApproachEnv(DrivingEnv):
         *,
         speed: float = SPEED_MPS,
         brakes: Brakes = Brakes(),  # noqa: B008
+        reaction_s: float = REACTION_S,
         seeds: Sequence[int] = (),
         plan: Plan = Plan(),  # noqa: B008
     ) -> None:
         super().__init__(device="cpu", batch_size=torch.Size([len(scenes)]))
         self.scenes, self.share, self.approach_speed, self.brakes = tuple(scenes), share, speed, brakes
         self.patches = None if patches is None else patches.expand(len(scenes), -1, -1, -1)
-        self.plan = plan
-        self.traffic = CrossTraffic.drawn(seeds)
-        self.distances = self.scenes[0].distance
-        self.step_s = float(self.distances[0] - self.distances[1]) / SPEED_MPS
+        self.plan, self.reaction_s = plan, reaction_s
         batch = len(scenes)
+        self.begun = self.traffic = CrossTraffic.drawn(seeds, batch)
+        self.distances = self.scenes[0].distance
+        self.step_s = float(-self.distances.diff().max()) / SPEED_MPS
+        width = self.scenes[0].boxes[:, 2] - self.scenes[0].boxes[:, 0]
+        # The median: a box at the edge of the image is cut off.
+        self.sign_px_m = float((width * self.distances).median())
         self.motion = Motion(*(torch.zeros(batch) for _ in range(3)))
-        self.seconds = torch.zeros(batch)
         self.hit = torch.zeros(batch, len(seeds), dtype=torch.bool)
         number = Unbounded(shape=(batch, 1), dtype=torch.float32)
         info = Composite(
             distance=number,
             speed=number.clone(),
             frame=Categorical(len(self.distances), shape=(batch, 1), dtype=torch.int64),
+            shown=number.clone(),
             box=Unbounded(shape=(batch, 4), dtype=torch.float32),
             visible=Bounded(0, 1, shape=(batch, 1), dtype=torch.float32),
-            others=Unbounded(shape=(batch, *self.traffic.half.shape[:2], 4), dtype=torch.float32),
+            others=Unbounded(shape=(*self.traffic.motion.speed.shape, 4), dtype=torch.float32),
             hit=Binary(shape=(batch, len(seeds)), dtype=torch.bool),
+            braked=Binary(shape=(batch, len(seeds)), dtype=torch.bool),
             shape=(batch,),
         )
         picture = Bounded(0, 1, shape=(batch, 3, *self.scenes[0].size), dtype=torch.float32)
@@ -100,7 +107,7 @@ class ApproachEnv(DrivingEnv):
         still = torch.zeros(self.batch_size)
         begin = Motion(still + self.distances[0], still + self.approach_speed, still)
         self.motion = begin.where(chosen, self.motion)
-        self.seconds = torch.where(chosen, 0.0, self.seconds)
+        self.traffic = self.begun.where(chosen, self.traffic)
         self.hit = self.hit & ~chosen[:, None]
         return self._shown()
 
@@ -109,9 +116,10 @@ class ApproachEnv(DrivingEnv):
         asked = tensordict["action"][:, 0]
         ticks = max(1, round(self.step_s / TICK_S))
         for _ in range(ticks):
-            moves = ~self._ended()
-            self.motion = self.brakes.moved(self.motion, asked, self.step_s / ticks).where(moves, self.motion)
-            self.seconds = torch.where(moves, self.seconds + self.step_s / ticks, self.seconds)
+            moves, tick_s = ~self._ended(), self.step_s / ticks
+            later = self.traffic.moved(self.motion, CAR_M, self.brakes, self.reaction_s, tick_s)
+            self.traffic = later.where(moves, self.traffic)
+            self.motion = self.brakes.moved(self.motion, asked, tick_s).where(moves, self.motion)
             self.hit = self.hit | (self._collided() & moves[:, None])
         stopped = running & (self.motion.speed <= STANDS_MPS) & (self.motion.distance >= 0)
         return self._shown().set("reward", stopped[:, None].float())
@@ -123,7 +131,7 @@ class ApproachEnv(DrivingEnv):
         """Whether each car overlaps a vehicle in each draw, [B, K]."""
         front, half = -self.motion.distance, torch.full_like(self.motion.distance, CAR_M[1] / 2)
         car = torch.stack([-half, front - CAR_M[0], half, front], -1)
-        return (overlap(car[:, None, None], self.traffic.at(self.seconds)) > 0).any(-1)
+        return (overlap(car[:, None, None], self.traffic.rectangles()) > 0).any(-1)
 
     def _shown(self) -> TensorDict:
         frames = (self.motion.distance[:, None] - self.distances).abs().argmin(-1)
@@ -138,10 +146,12 @@ class ApproachEnv(DrivingEnv):
             "distance": self.motion.distance[:, None].clone(),
             "speed": self.motion.speed[:, None].clone(),
             "frame": frames[:, None],
+            "shown": self.distances[frames][:, None],
             "box": torch.stack(boxes),
             "visible": torch.stack(visible),
-            "others": self.traffic.at(self.seconds),
+            "others": self.traffic.rectangles(),
             "hit": self.hit.clone(),
+            "braked": self.traffic.braked,
         }
         content = {
             "observation": torch.stack(pictures).detach(),

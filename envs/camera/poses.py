@@ -25,8 +25,8 @@ DAYLIGHT: tuple[Lighting, ...] = ("sun", "overcast")
 LEAST_VISIBLE = 0.6
 """Approximate share of the sign that a training view shows at least."""
 CLOSED_LOOP_LANES, CLOSED_LOOP_DENSITY = 3, 1.0
-CLOSED_LOOP_DISTANCES = tuple(float(distance) for distance in np.arange(30.0, 7.9, -0.5))
-"""Distances of the frames of the closed loop to the sign, in m."""
+CLOSED_LOOP_DISTANCES = tuple(map(float, (*np.arange(60.0, 30.5, -1.0), *np.arange(30.0, 7.9, -0.5))))
+"""Distances of the frames of the closed loop to the sign, in m: twice as far apart where the sign grows half as fast."""
 ONE_ROAD_LANES, ONE_ROAD_DENSITY = 4, 1.0
 
 

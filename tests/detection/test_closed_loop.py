@@ -15,11 +15,11 @@ from cavbench.detection import stopping
 from cavbench.detection.boxes import overlap
 from cavbench.detection.closed_loop import Drive, drive, measured
 from cavbench.envs.camera.braking import Brakes, brakes_in
-from cavbench.envs.camera.cross_traffic import CrossTraffic
+from cavbench.envs.camera.cross_traffic import SPEED_MPS, CrossTraffic
 from cavbench.envs.camera.environment import CAR_M, ApproachEnv
 from cavbench.envs.camera.street.layout import CROSSING
 from cavbench.envs.weather import WEATHERS
-from tests.plugins.toy_camera import RedDetector, RedScenes
+from tests.detection.growing_signs import GrowingScenes, SquareDetector
 
 DISTANCES = torch.arange(30.0, 7.9, -0.5)
 CYAN = torch.tensor([0.0, 1.0, 1.0])[:, None, None].expand(1, 3, 8, 8)
@@ -29,9 +29,8 @@ SEEN = st.lists(st.booleans(), min_size=len(DISTANCES), max_size=len(DISTANCES))
 
 def driven(seen: list[bool], speed: float = stopping.SPEED_MPS, brakes: Brakes = Brakes()) -> Drive:  # noqa: B008
     """The drive of a car whose detector sees the sign in these frames only."""
-    scenes = RedScenes(DISTANCES)
-    scenes.red = torch.tensor(seen).float()
-    return drive(RedDetector(), ApproachEnv([scenes], speed=speed, brakes=brakes))
+    scenes = GrowingScenes(DISTANCES, torch.tensor(seen))
+    return drive(SquareDetector(), ApproachEnv([scenes], speed=speed, brakes=brakes))
 
 
 @settings(deadline=None, max_examples=10)
@@ -87,8 +86,10 @@ def test_the_collision_test_is_symmetric_and_that_of_shared_area(a: Tensor, b: T
 
 
 def test_a_patch_that_hides_the_sign_sends_the_car_into_the_crossing() -> None:
-    scenes, seeds = RedScenes(DISTANCES), range(200)
-    clean, patched = (drive(RedDetector(), ApproachEnv([scenes], patch, 0.75, seeds=seeds)) for patch in (None, CYAN))
+    scenes, seeds = GrowingScenes(DISTANCES), range(200)
+    clean, patched = (
+        drive(SquareDetector(), ApproachEnv([scenes], patch, 0.75, seeds=seeds)) for patch in (None, CYAN)
+    )
     assert clean.stopped
     assert not clean.collided.any()
     assert not patched.confirmed_m
@@ -102,12 +103,14 @@ def test_a_patch_that_hides_the_sign_sends_the_car_into_the_crossing() -> None:
 def test_a_car_is_hit_if_and_only_if_its_path_and_that_of_a_vehicle_meet() -> None:
     """Computed again from the paths: while the car is in a lane, does a vehicle of that lane pass its width?"""
     seeds = range(100)
-    patched = drive(RedDetector(), ApproachEnv([RedScenes(DISTANCES)], CYAN, 0.75, seeds=seeds))
+    patched = drive(
+        SquareDetector(), ApproachEnv([GrowingScenes(DISTANCES)], CYAN, 0.75, seeds=seeds, reaction_s=math.inf)
+    )
     traffic = CrossTraffic.drawn(seeds)
     half, first_m = traffic.half, float(DISTANCES[0])
     enters = (first_m + traffic.y - half[..., 1]) / stopping.SPEED_MPS
     leaves = (first_m + traffic.y + half[..., 1] + CAR_M[0]) / stopping.SPEED_MPS
-    reach = (half[..., 0] + CAR_M[1] / 2) / traffic.speed.abs()
-    meets = ((traffic.passes + reach > enters) & (traffic.passes - reach < leaves)).any(1)
+    passes, reach = traffic.motion.distance[0] / SPEED_MPS, (half[..., 0] + CAR_M[1] / 2) / SPEED_MPS
+    meets = ((passes + reach > enters) & (passes - reach < leaves)).any(1)
     # The loop looks every hundredth of a second.
     assert (torch.from_numpy(patched.collided) != meets).float().mean() <= 0.02

@@ -160,9 +160,12 @@ class CameraSuite(Suite):
             return "none"
         require(tuple(env.batch_size) == (1,), f"its environment has {list(env.batch_size)} cars, not one")
         now = env.reset()
-        missing = {"distance", "speed", "frame", "box", "others", "hit"} - set(now["info"].keys())
+        missing = {"distance", "speed", "frame", "shown", "box", "others", "hit", "braked"} - set(now["info"].keys())
         require(not missing, f"the info of its environment lacks {', '.join(sorted(missing))}")
-        require(tuple(now["info", "hit"].shape) == (1, len(seeds)), "info.hit must have one value for each seed")
+        for name in ("hit", "braked"):
+            shape = tuple(now["info", name].shape)
+            require(shape == (1, len(seeds)), f"info.{name} must have one value for each seed")
+        require(env.sign_px_m > 0, f"sign_px_m of its environment must be above 0, got {env.sign_px_m}")
         scenes, frame = self.component.approaches(cell, seeds[:1])[0].scenes, now["info", "frame"][0]
         require(
             torch.allclose(now["observation"], scenes.render(frame, None, SHARE), atol=1e-5),

@@ -22,7 +22,7 @@ CAMERA = 760
 """Width of the camera's image in the film, in pixels."""
 INSET, MARGIN = 110, 1.0
 """Side of the enlarged sign in pixels, and the space around the sign as a share of its width."""
-BEHIND_M, BEYOND_M, SCALE = 34.0, 16.0, 8.0
+BEHIND_M, BEYOND_M, SCALE = 66.0, 16.0, 6.5
 """Metres of road before and beyond the line that are seen from above, and pixels a metre; the car drives to the right."""
 HEADER, TITLE, GAP = 36, 28, 8
 
@@ -80,6 +80,7 @@ class DriveFilm(Film):
     def _outcome(self, drive: Drive, moment: Moment) -> str:
         """How a drive ended, as text."""
         seen = f"confirmed at {drive.confirmed_m:.1f} m" if drive.confirmed_m else "never confirmed"
+        seen += f", something else at {drive.false_m:.1f} m" if drive.false_m else ""
         if moment.hit[self.drives.draw]:
             does = f"the car collides at {moment.speed_mps:.1f} m/s"
         elif not drive.stands:

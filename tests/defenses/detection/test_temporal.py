@@ -205,7 +205,7 @@ def test_yolov3_tiny_keeps_a_sign_that_a_noise_patch_flickers_away() -> None:
     """A real detector on real frames: the fused score is the filter's of the frame scores at the sign's moving place."""
     (whole,) = StopSignCrossing().approaches(StopSignCrossing.axes.cell(weather="clear", speed=10.0), range(1))
     assert isinstance(whole.scenes, BankScenes)
-    frames = list(zip(whole.scenes.poses, whole.scenes.frames, strict=True))[20:44:4]
+    frames = list(zip(whole.scenes.poses, whole.scenes.frames, strict=True))[50:74:4]
     scenes = BankScenes(frames, ["clear"] * len(frames))
     detector = TemporalFusion().load(YOLOv3Tiny(), 0, StopSignApproach().facts)
     with torch.no_grad():
