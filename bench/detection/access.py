@@ -165,6 +165,9 @@ class PatchEnforcer:
         self._switch(True)
         try:
             yield
+        except BaseException:
+            self._modes.put_back()
+            raise
         finally:
             self._switch(False)
             torch.set_grad_enabled(differentiates)

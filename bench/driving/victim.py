@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -65,6 +66,9 @@ class CountedPolicy:
         self._switch(True, self.stream)
         try:
             yield
+        except BaseException:
+            self._modes.put_back()
+            raise
         finally:
             self._switch(False, self.stream)
             torch.set_grad_enabled(differentiates)
@@ -115,21 +119,16 @@ class CountedPolicy:
 
     def initial(self, episodes: Tensor) -> State:
         """The policy's state before the first step; `episodes` are opaque numbers."""
-        state = self.policy.initial(episodes)
-        self._modes.settle("defense")
-        return state
+        return self._called(self.policy.initial, episodes)
 
     def advance(self, observation: Tensor, action: Tensor, state: State) -> State:
         """The policy's state after a step, as a copy that nobody else has."""
-        after = self.policy.advance(plain(observation), action.clone(), state)
-        self._modes.settle("defense")
+        after = self._called(self.policy.advance, plain(observation), action.clone(), state)
         return None if after is None else after.clone()
 
     def choose(self, scores: Tensor) -> Tensor:
         """The actions [B] (or [B, 2]) for scores of the policy."""
-        action = self.policy.choose(scores)
-        self._modes.settle("defense")
-        return action
+        return self._called(self.policy.choose, scores)
 
     def aside(self, observation: Tensor, state: State, numbers: Tensor | None = None) -> Tensor:
         """The scores [B, A], as in `noticed`, and what is drawn is put back."""
@@ -199,8 +198,7 @@ class CountedPolicy:
             outer = torch.autograd.grad(value.sum(), shown, allow_unused=True)[0] if value.requires_grad else None
         gradient = None
         if outer is not None and scores.requires_grad:
-            (gradient,) = torch.autograd.grad(scores, asked, outer, allow_unused=True)
-            self._modes.settle("defense")
+            (gradient,) = self._called(torch.autograd.grad, scores, asked, outer, allow_unused=True)
         return value.detach(), torch.zeros_like(asked).detach() if gradient is None else gradient
 
     def valued(
@@ -211,16 +209,29 @@ class CountedPolicy:
         asked = action.detach().clone()
         if not asked.is_floating_point():
             with given(numbers):
-                value = self.policy.value(observation.clone(), asked, state).detach()
-            self._modes.settle("defense")
-            return value, None
+                return self._called(self.policy.value, observation.clone(), asked, state).detach(), None
         asked.requires_grad_(True)
         with torch.enable_grad():
             with given(numbers):
-                value = self.policy.value(observation.clone(), asked, state)
-            found = torch.autograd.grad(value.sum(), asked, allow_unused=True) if value.requires_grad else (None,)
+                value = self._called(self.policy.value, observation.clone(), asked, state)
+            slope = None
+            if value.requires_grad:
+                (slope,) = self._called(torch.autograd.grad, value.sum(), asked, allow_unused=True)
+        return value.detach(), torch.zeros_like(asked).detach() if slope is None else slope
+
+    def _called(self, work: Callable[..., Any], *given: Any, **named: Any) -> Any:
+        """What code of the victim returns; torch's modes are the run's again after it.
+
+        Raises:
+            TamperError: if it left a mode on.
+        """
+        try:
+            answer = work(*given, **named)
+        except BaseException:
+            self._modes.put_back()
+            raise
         self._modes.settle("defense")
-        return value.detach(), torch.zeros_like(asked).detach() if found[0] is None else found[0]
+        return answer
 
     def _scores(
         self, observation: Tensor, state: State, where: str = "to a query", numbers: Tensor | None = None
@@ -232,8 +243,7 @@ class CountedPolicy:
         """
         self.evaluations += len(observation)
         with given(numbers) as found:
-            scores = self.policy.scores(observation, state)
-        self._modes.settle("defense")
+            scores = self._called(self.policy.scores, observation, state)
         if found is not None and found.calls:
             self.draws = True
         if type(scores) is not Tensor:

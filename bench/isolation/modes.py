@@ -5,12 +5,15 @@ An attack that leaves one on would change the victim, or what enforces the threa
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
 import torch
+from torch import overrides
 from torch.nn.modules import module as modules
+from torch.utils import _python_dispatch as dispatch
 
 from cavbench.isolation.watch import Side, TamperError
 
@@ -59,12 +62,20 @@ class Modes:
             )
 
     def settle(self, *sides: Side) -> None:
-        """Put back what changes numbers, after code of these sides ran.
+        """Put back what code of these sides has changed.
 
         Raises:
-            TamperError: if it left something on torch's stacks, which cannot be put back.
+            TamperError: if it left something on torch's stacks.
         """
-        self.check("left", *sides)
+        try:
+            self.check("left", *sides)
+        finally:
+            self.put_back()
+
+    def put_back(self) -> None:
+        """Put back what was changed, without a word: where that code raises anyway."""
+        if stacked() != self._stacked:
+            clear(self._stacked)
         if numbers() != self._numbers:
             put(self._numbers)
 
@@ -111,7 +122,11 @@ def kept(*sides: Side) -> Iterator[None]:
         TamperError: if it left something on torch's stacks.
     """
     modes = Modes()
-    yield
+    try:
+        yield
+    except BaseException:
+        modes.put_back()
+        raise
     modes.settle(*sides)
 
 
@@ -142,6 +157,25 @@ def stacked() -> tuple[int, ...]:
         sum(map(len, HOOKS)),
         _replaced(),
     )
+
+
+def clear(wanted: tuple[int, ...]) -> None:
+    """Take from torch's stacks what is there beside what `stacked` returned, the latest first."""
+    functions, operations, transforms, saved, _, replaced = wanted
+    while torch._C._len_torch_function_stack() > functions:
+        overrides._pop_mode()
+    while torch._C._len_torch_dispatch_stack() > operations:
+        dispatch._pop_mode()
+    while (torch._C._functorch.maybe_current_level() or 0) > transforms:
+        torch._C._functorch.pop_dynamic_layer_stack()
+    while not saved and torch._C._autograd._top_saved_tensors_default_hooks(True) is not None:
+        torch._C._autograd._pop_saved_tensors_default_hooks()
+    while sum(map(len, HOOKS)) > wanted[4]:
+        next(hooks for hooks in HOOKS if hooks).popitem()
+    if _replaced() > replaced:
+        for one in gc.get_objects():
+            if type(one) is torch.library.Library and one.ns == "aten":
+                one._destroy()
 
 
 class Numbers(NamedTuple):

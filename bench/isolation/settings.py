@@ -117,13 +117,16 @@ def _torch() -> Any:
     return sys.modules["torch"]
 
 
-def _modes() -> tuple[int, int, bool]:
-    """How many modes change what torch's functions do: a default device is one. And whether saved tensors are replaced."""
-    from torch.overrides import _get_current_function_mode_stack
-    from torch.utils._python_dispatch import _get_current_dispatch_mode_stack
+def _stacked() -> tuple[int, ...]:
+    from cavbench.isolation.modes import stacked
 
-    hooks = _torch()._C._autograd._top_saved_tensors_default_hooks(True)
-    return len(_get_current_function_mode_stack()), len(_get_current_dispatch_mode_stack()), hooks is not None
+    return stacked()
+
+
+def _clear(before: tuple[int, ...]) -> None:
+    from cavbench.isolation.modes import clear
+
+    clear(before)
 
 
 def _backend(where: str) -> Any:
@@ -307,7 +310,8 @@ SETTINGS = (
         module="torch",
         usual="cpu",
     ),
-    Setting(name="the modes of torch", read=_modes, module="torch", usual=(0, 0, False)),
+    # A default device is one.
+    Setting(name="the modes of torch", read=_stacked, write=_clear, module="torch", usual=(0,) * 6),
     Setting(
         name="the gradient mode of torch",
         read=lambda: (_torch().is_grad_enabled(), _torch().is_inference_mode_enabled()),

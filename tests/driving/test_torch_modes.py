@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cavbench.driving import Oracle
 from cavbench.driving.policy import State
-from cavbench.isolation.modes import numbers, put
+from cavbench.isolation.modes import numbers, put, stacked
 from cavbench.isolation.watch import TamperError
 from tests.driving.cheats import Victim, drive
 from tests.isolation.torch_modes import NUMBERS, STACKED, Left, Mode
@@ -38,6 +38,30 @@ def test_a_mode_that_an_attack_leaves_on_is_noticed(name: str) -> None:
     ):
         drive(lambda observation, oracle: mode.enter())
     assert caught.value.sides == ("attack",)
+
+
+@pytest.mark.parametrize("name", STACKED)
+@pytest.mark.parametrize("who", ["attack", "victim", "nobody raises"])
+def test_nothing_is_left_for_the_next_unit(name: str, who: str) -> None:
+    """Nor where the code that switched it on raises something else."""
+    before = stacked()
+
+    class Raises(Victim):
+        def scores(self, observation: Tensor, state: State = None) -> Tensor:
+            if who == "victim":
+                mode.enter()
+                raise ZeroDivisionError
+            return super().scores(observation, state)
+
+    def deed(observation: Tensor, oracle: Oracle) -> None:
+        mode.enter()
+        if who == "attack":
+            raise ZeroDivisionError
+
+    with Left(name) as mode:
+        with pytest.raises(TamperError if who == "nobody raises" else ZeroDivisionError):
+            drive(deed if who != "victim" else None, Raises())
+        assert stacked() == before
 
 
 @pytest.mark.parametrize("name", STACKED)

@@ -81,6 +81,6 @@ class Left:
             self.mode.__enter__()
 
     def leave(self) -> None:
-        if self.entered:
-            self.entered = False
+        if self.entered and stacked() != self.before:
             self.mode.__exit__(None, None, None)
+        self.entered = False
