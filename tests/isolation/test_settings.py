@@ -80,7 +80,8 @@ STAYS = {
     "import os; os.close(2)": "changes open files of the process",
     "import os; os.dup2(os.open('/dev/null', 1), 1); os.dup2(os.open('/dev/zero', 0), 2)": "changes open files of the process",
     "import threading, time; threading.Thread(target=time.sleep, args=(99,)).start()": "changes the threads that hold the end",
-    "import torch; torch.nn.modules.module.register_module_forward_hook(print)": "changes the modes of torch, the hooks of all modules of torch",
+    "import torch; torch.nn.modules.module.register_module_forward_hook(print)":
+        "changes the modes of torch, the hooks of all modules of torch",
     "import torch; torch.overrides.TorchFunctionMode().__enter__()": "changes the default device of torch, the modes of torch",
     "import atexit, time; atexit.register(time.sleep, 99)": "leaves a hook for the end of the process that does not end within",
     "import subprocess; subprocess.Popen(['sleep', '99'])": "leaves a process that outlives the command (sleep)",
