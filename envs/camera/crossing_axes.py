@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cavbench.envs.camera.windscreen_axes import LENSES
+from cavbench.envs.camera.windscreen_axes import LENS
 from cavbench.scenarios import Axes, Axis, Grid
 
 AXES = Axes(
@@ -23,13 +23,7 @@ AXES = Axes(
             high=14.0,
             default=10.0,
         ),
-        Axis(
-            name="lens",
-            kind="str",
-            meaning="what is between the street and the sensor",
-            choices=LENSES,
-            default="clean",
-        ),
+        LENS,
     )
 )
 CROSSING_V2 = Grid(

@@ -7,19 +7,15 @@ from cavbench.scenarios import Axes, Axis, Grid
 
 LENSES = ("clean", "drops", "glare", "blur")
 
-AXES = Axes(
-    (
-        *STREET_AXES.values(),
-        Axis(
-            name="lens",
-            kind="str",
-            meaning="what is between the street and the sensor",
-            choices=LENSES,
-            default="clean",
-            perceptual=True,
-        ),
-    )
+LENS = Axis(
+    name="lens",
+    kind="str",
+    meaning="what is between the street and the sensor",
+    choices=LENSES,
+    default="clean",
+    perceptual=True,
 )
+AXES = Axes((*STREET_AXES.values(), LENS))
 
 WINDSCREEN_V1 = Grid(
     name="windscreen-v1",
