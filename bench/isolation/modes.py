@@ -131,37 +131,38 @@ def kept(*sides: Side) -> Iterator[None]:
 
 
 class _Replaced:
-    """Counts torch's operators for the processor that Python code implements."""
+    """The names of torch's operators for the processor that Python code implements; a library may do so on import."""
 
     def __init__(self) -> None:
-        self._known, self._count = 0, 0
+        self._known, self._names = 0, frozenset[str]()
 
-    def __call__(self) -> int:
+    def __call__(self) -> frozenset[str]:
         made = torch.library._impls
         if len(made) != self._known:
             self._known = len(made)
-            self._count = sum(name.startswith("aten/") and not name.endswith(ELSEWHERE) for name in made)
-        return self._count
+            self._names = frozenset(name for name in made if name.startswith("aten/") and not name.endswith(ELSEWHERE))
+        return self._names
 
 
 _replaced = _Replaced()
+Stacked = tuple[int, int, int, int, tuple[int, ...], frozenset[str]]
 
 
-def stacked() -> tuple[int, ...]:
-    """How much is on each of torch's stacks."""
+def stacked() -> Stacked:
+    """What is on each of torch's stacks: how much, or the names."""
     return (
         torch._C._len_torch_function_stack(),
         torch._C._len_torch_dispatch_stack(),
         torch._C._functorch.maybe_current_level() or 0,
         int(torch._C._autograd._top_saved_tensors_default_hooks(True) is not None),
-        sum(map(len, HOOKS)),
+        tuple(map(len, HOOKS)),
         _replaced(),
     )
 
 
-def clear(wanted: tuple[int, ...]) -> None:
+def clear(wanted: Stacked) -> None:
     """Take from torch's stacks what is there beside what `stacked` returned, the latest first."""
-    functions, operations, transforms, saved, _, replaced = wanted
+    functions, operations, transforms, saved, hooked, replaced = wanted
     while torch._C._len_torch_function_stack() > functions:
         overrides._pop_mode()
     while torch._C._len_torch_dispatch_stack() > operations:
@@ -170,11 +171,12 @@ def clear(wanted: tuple[int, ...]) -> None:
         torch._C._functorch.pop_dynamic_layer_stack()
     while not saved and torch._C._autograd._top_saved_tensors_default_hooks(True) is not None:
         torch._C._autograd._pop_saved_tensors_default_hooks()
-    while sum(map(len, HOOKS)) > wanted[4]:
-        next(hooks for hooks in HOOKS if hooks).popitem()
-    if _replaced() > replaced:
+    for hooks, before in zip(HOOKS, hooked, strict=True):
+        while len(hooks) > before:
+            hooks.popitem()
+    if added := _replaced() - replaced:
         for one in gc.get_objects():
-            if type(one) is torch.library.Library and one.ns == "aten":
+            if type(one) is torch.library.Library and not added.isdisjoint(one._op_impls):
                 one._destroy()
 
 

@@ -117,13 +117,13 @@ def _torch() -> Any:
     return sys.modules["torch"]
 
 
-def _stacked() -> tuple[int, ...]:
+def _stacked() -> tuple[Any, ...]:
     from cavbench.isolation.modes import stacked
 
     return stacked()
 
 
-def _clear(before: tuple[int, ...]) -> None:
+def _clear(before: Any) -> None:
     from cavbench.isolation.modes import clear
 
     clear(before)
@@ -311,7 +311,13 @@ SETTINGS = (
         usual="cpu",
     ),
     # A default device is one.
-    Setting(name="the modes of torch", read=_stacked, write=_clear, module="torch", usual=(0,) * 6),
+    Setting(
+        name="the modes of torch",
+        read=_stacked,
+        write=_clear,
+        module="torch",
+        usual=(0, 0, 0, 0, (0,) * 4, frozenset()),
+    ),
     Setting(
         name="the gradient mode of torch",
         read=lambda: (_torch().is_grad_enabled(), _torch().is_inference_mode_enabled()),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
@@ -180,3 +181,18 @@ def test_attacks_compute_in_modes_of_their_own(mode: Mode) -> None:
 
     drive(deed)
     assert all(bool((one == 0).all()) for one in answers)
+
+
+def test_an_operator_of_a_library_stays() -> None:
+    """Libraries replace operators when they are imported, before a unit begins."""
+    with Left("an operator of its own") as library:
+        library.enter()
+        with_library, other = stacked(), torch.library.Library("aten", "IMPL")
+
+        def deed(observation: Tensor, oracle: Oracle) -> None:
+            with warnings.catch_warnings(action="ignore"):
+                other.impl("lgamma", lambda values: values * 0, "CPU")
+
+        with pytest.raises(TamperError, match="the attack left an operator of its own"):
+            drive(deed)
+        assert stacked() == with_library
