@@ -161,17 +161,12 @@ class PatchEnforcer:
         Raises:
             TamperError: if it reached the detector past the oracle, changed the counts, or left a mode of torch on.
         """
-        differentiates = torch.is_grad_enabled()
         self._switch(True)
         try:
-            yield
-        except BaseException:
-            self._modes.put_back()
-            raise
+            with self._modes.around("attack"):
+                yield
         finally:
             self._switch(False)
-            torch.set_grad_enabled(differentiates)
-        self._modes.settle("attack")
         if self.spent != self._evaluated:
             raise TamperError("the attack changed the count of its queries", "attack")
         if self.watch and self.watch.strays:

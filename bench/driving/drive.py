@@ -125,10 +125,8 @@ def _columns(jobs: Sequence[Job], trace: Trace | None = None) -> Columns:
         try:
             dynamics = world.dynamics(cells, declared.action_type)
             with kept("defense", "attack"):
-                policy, attack = (
-                    _checked(pair.load(first.training_seed, first.cell), pair),
-                    pair.armed(first.training_seed),
-                )
+                policy = _checked(pair.load(first.training_seed, first.cell), pair)
+                attack = pair.armed(first.training_seed)
             policy = placed(policy, first.device)
             columns = rollout(
                 env,

@@ -62,17 +62,12 @@ class CountedPolicy:
     @contextmanager
     def turn(self) -> Iterator[None]:
         """Run an attack: with its own random numbers, and with an eye on evaluations that it does not ask the oracle for."""
-        differentiates = torch.is_grad_enabled()
         self._switch(True, self.stream)
         try:
-            yield
-        except BaseException:
-            self._modes.put_back()
-            raise
+            with self._modes.around("attack"):
+                yield
         finally:
             self._switch(False, self.stream)
-            torch.set_grad_enabled(differentiates)
-        self._modes.settle("attack")
 
     @contextmanager
     def asked(self, foreign: bool = False) -> Iterator[None]:

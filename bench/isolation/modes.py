@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import gc
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from functools import lru_cache
 from typing import NamedTuple
 
 import torch
@@ -36,6 +37,9 @@ STACKS = (
 """What `stacked` counts, as messages call it."""
 
 
+Stacked = tuple[int, int, int, int, tuple[int, ...], frozenset[str]]
+
+
 class Modes:
     """The modes of torch as they are now. They are the run's: the victim is asked, and scores are computed, in them."""
 
@@ -43,17 +47,17 @@ class Modes:
         self._stacked, self._numbers = stacked(), numbers()
         self._theirs = self._numbers
 
-    def check(self, did: str, *sides: Side) -> None:
+    def check(self, found: Stacked, did: str, *sides: Side) -> None:
         """Raise if more or less is on torch's stacks than at first.
 
         Args:
+            found: what is there.
             did: what was done with it, as "left".
             sides: whose code ran.
 
         Raises:
             TamperError: if so.
         """
-        found = stacked()
         if found != self._stacked:
             changed = [noun for noun, here, before in zip(STACKS, found, self._stacked, strict=True) if here != before]
             whose = " or the ".join(sides)
@@ -67,17 +71,33 @@ class Modes:
         Raises:
             TamperError: if it left something on torch's stacks.
         """
-        try:
-            self.check("left", *sides)
-        finally:
-            self.put_back()
+        self.check(self.put_back(), "left", *sides)
 
-    def put_back(self) -> None:
-        """Put back what was changed, without a word: where that code raises anyway."""
-        if stacked() != self._stacked:
+    def put_back(self) -> Stacked:
+        """Put back what was changed, without a word, and return what was on torch's stacks."""
+        found = stacked()
+        if found != self._stacked:
             clear(self._stacked)
         if numbers() != self._numbers:
             put(self._numbers)
+        return found
+
+    @contextmanager
+    def around(self, *sides: Side) -> Iterator[None]:
+        """Run code of these sides: the modes are the run's again after it, and so is whether gradients are computed.
+
+        Raises:
+            TamperError: if it left something on torch's stacks.
+        """
+        differentiates = torch.is_grad_enabled()
+        try:
+            yield
+        except BaseException:
+            self.put_back()
+            raise
+        finally:
+            torch.set_grad_enabled(differentiates)
+        self.settle(*sides)
 
     @contextmanager
     def for_victim(self) -> Iterator[None]:
@@ -86,7 +106,7 @@ class Modes:
         Raises:
             TamperError: if something of the attack is on torch's stacks.
         """
-        self.check("asked under", "attack")
+        self.check(stacked(), "asked under", "attack")
         self._theirs = numbers()
         if self._theirs != self._numbers:
             put(self._numbers)
@@ -111,41 +131,18 @@ class Modes:
             self._theirs = numbers()
             if self._theirs != self._numbers:
                 put(self._numbers)
-        self.check("left", "attack")
+        self.check(stacked(), "left", "attack")
 
 
-@contextmanager
-def kept(*sides: Side) -> Iterator[None]:
-    """Run code of these sides; the modes are as before after it.
-
-    Raises:
-        TamperError: if it left something on torch's stacks.
-    """
-    modes = Modes()
-    try:
-        yield
-    except BaseException:
-        modes.put_back()
-        raise
-    modes.settle(*sides)
+def kept(*sides: Side) -> AbstractContextManager[None]:
+    """Run code of these sides; the modes are as before after it (`Modes.around`)."""
+    return Modes().around(*sides)
 
 
-class _Replaced:
-    """The names of torch's operators for the processor that Python code implements; a library may do so on import."""
-
-    def __init__(self) -> None:
-        self._known, self._names = 0, frozenset[str]()
-
-    def __call__(self) -> frozenset[str]:
-        made = torch.library._impls
-        if len(made) != self._known:
-            self._known = len(made)
-            self._names = frozenset(name for name in made if name.startswith("aten/") and not name.endswith(ELSEWHERE))
-        return self._names
-
-
-_replaced = _Replaced()
-Stacked = tuple[int, int, int, int, tuple[int, ...], frozenset[str]]
+@lru_cache(maxsize=1)
+def _replaced(count: int) -> frozenset[str]:
+    """The names of torch's operators for the processor that Python code implements; `count` is that of all it implements."""
+    return frozenset(name for name in torch.library._impls if name.startswith("aten/") and not name.endswith(ELSEWHERE))
 
 
 def stacked() -> Stacked:
@@ -156,7 +153,8 @@ def stacked() -> Stacked:
         torch._C._functorch.maybe_current_level() or 0,
         int(torch._C._autograd._top_saved_tensors_default_hooks(True) is not None),
         tuple(map(len, HOOKS)),
-        _replaced(),
+        # A library may implement some when it is imported.
+        _replaced(len(torch.library._impls)),
     )
 
 
@@ -174,7 +172,7 @@ def clear(wanted: Stacked) -> None:
     for hooks, before in zip(HOOKS, hooked, strict=True):
         while len(hooks) > before:
             hooks.popitem()
-    if added := _replaced() - replaced:
+    if added := _replaced(len(torch.library._impls)) - replaced:
         for one in gc.get_objects():
             if type(one) is torch.library.Library and not added.isdisjoint(one._op_impls):
                 one._destroy()

@@ -19,7 +19,7 @@ from cavbench.detection.threat import PatchThreat
 from cavbench.isolation.modes import numbers
 from cavbench.isolation.watch import TamperError
 from tests.detection.test_bending_patches import Does
-from tests.isolation.torch_modes import NUMBERS, STACKED, Left
+from tests.isolation.torch_modes import NUMBERS, STACKED, Left, leaving
 from tests.plugins.toy_camera import RedDetector, RedScenes
 
 SCENES = RedScenes(torch.linspace(8, 30, 6))
@@ -58,19 +58,16 @@ def test_a_detector_is_not_asked_under_a_mode_of_the_attack(name: str) -> None:
 @pytest.mark.parametrize("name", STACKED)
 @pytest.mark.parametrize("where", ["predict", "advance", "aggregate"])
 def test_a_mode_that_a_detector_leaves_on_is_noticed(name: str, where: str) -> None:
-    class Leaves(RedDetector):
-        pass
-
-    def leaving(self: RedDetector, *given: Any) -> Any:
-        mode.enter()
-        return getattr(RedDetector, where)(self, *given)
-
-    setattr(Leaves, where, leaving)
-    with Left(name) as mode, pytest.raises(TamperError, match=f"the defense left {name}"), torch.no_grad():
-        probed(Leaves(), [Approach(0, "front", SCENES)], [look(Leaves(), SCENES, None, 0.5)], None, 0.5, 0)
-    if where != "advance":
-        with Left(name) as mode, pytest.raises(TamperError, match=f"the defense left {name}"):
-            crafted(lambda oracle, scenes: (ask(oracle, scenes), oracle.aggregate(torch.rand(4))), Leaves())
+    with Left(name) as mode:
+        detector, said = leaving(RedDetector, where, mode)(), f"the defense left {name}"
+        with pytest.raises(TamperError, match=said), torch.no_grad():
+            probed(detector, [Approach(0, "front", SCENES)], [look(detector, SCENES, None, 0.5)], None, 0.5, 0)
+    if where == "advance":
+        return
+    with Left(name) as mode:
+        detector = leaving(RedDetector, where, mode)()
+        with pytest.raises(TamperError, match=said):
+            crafted(lambda oracle, scenes: (ask(oracle, scenes), oracle.aggregate(torch.rand(4))), detector)
 
 
 @pytest.mark.parametrize("change", NUMBERS.values(), ids=NUMBERS)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import pytest
 import torch
@@ -15,7 +15,7 @@ from cavbench.driving.policy import State
 from cavbench.isolation.modes import numbers, put, stacked
 from cavbench.isolation.watch import TamperError
 from tests.driving.cheats import Victim, drive
-from tests.isolation.torch_modes import NUMBERS, STACKED, Left, Mode
+from tests.isolation.torch_modes import NUMBERS, STACKED, Left, Mode, leaving
 
 
 @pytest.fixture(autouse=True)
@@ -88,17 +88,8 @@ def test_a_transform_around_a_question_is_noticed() -> None:
 @pytest.mark.parametrize("where", ["scores", "choose", "advance", "initial", "assured"])
 @pytest.mark.parametrize("attacked", [False, True])
 def test_a_mode_that_a_victim_leaves_on_is_noticed(name: str, where: str, attacked: bool) -> None:
-
-    class Leaves(Victim):
-        pass
-
-    def leaving(self: Victim, *given: Any) -> Any:
-        mode.enter()
-        return getattr(Victim, where)(self, *given)
-
-    setattr(Leaves, where, leaving)
     with Left(name) as mode, pytest.raises(TamperError, match=f"the defense left {name}") as caught:
-        drive(asks if attacked else None, Leaves())
+        drive(asks if attacked else None, leaving(Victim, where, mode)())
     assert caught.value.sides == ("defense",)
 
 

@@ -67,6 +67,16 @@ NUMBERS: dict[str, Callable[[], object]] = {
 }
 
 
+def leaving(kind: type[Any], method: str, mode: Left) -> Any:
+    """A subclass of a victim that switches a mode on in a method, and leaves it on."""
+
+    def entering(self: Any, *given: Any) -> Any:
+        mode.enter()
+        return getattr(kind, method)(self, *given)
+
+    return type("Leaves", (kind,), {method: entering})
+
+
 class Left:
     """A mode that is entered once, and left at the end of a test: `with Left(NAME) as mode: ... mode.enter()`."""
 
