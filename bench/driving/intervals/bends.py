@@ -52,8 +52,13 @@ class Table(NamedTuple):
     length: Tensor
 
 
+def _table(way: Way, like: Tensor) -> Table:
+    """The stretches, in the type and on the device of a tensor."""
+    return Table(*(column.to(like) for column in _columns(way)))
+
+
 @cache
-def _table(way: Way) -> Table:
+def _columns(way: Way) -> Table:
     """The stretches; `begin` and `end` are where each ends along itself, in m: the way goes on beyond both of its ends."""
     rows = [(one.x, one.y, one.heading, one.curvature, at) for one, at in zip(way.stretches, way.stations, strict=True)]
     lengths = [one.length for one in way.stretches]
@@ -102,7 +107,7 @@ def enclosed(way: Way, lane_width: float, low: Tensor, high: Tensor) -> Enclosur
         lane_width: in m.
         low, high: x and y of the rectangle, in m, [..., 2].
     """
-    table = Table(*(column.to(low) for column in _table(way)))
+    table = _table(way, low)
     x = torch.stack([low[..., 0], low[..., 0], high[..., 0], high[..., 0]], -1).unsqueeze(-2)
     y = torch.stack([low[..., 1], high[..., 1], low[..., 1], high[..., 1]], -1).unsqueeze(-2)
     cos, sin = table.heading.cos().unsqueeze(-1), table.heading.sin().unsqueeze(-1)
@@ -192,20 +197,20 @@ def points(way: Way, station: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
 
 def _at(way: Way, station: Tensor) -> tuple[Table, Tensor]:
     """The stretches, and the number of that at each station [...]."""
-    table = Table(*(column.to(station) for column in _table(way)))
+    table = _table(way, station)
     return table, ((station.unsqueeze(-1) >= table.station).sum(-1) - 1).clamp(min=0)
 
 
 def turned(way: Way, station: Tensor) -> Tensor:
     """By how much the way has turned from its beginning to stations [...], in rad."""
-    table = Table(*(column.to(station) for column in _table(way)))
+    table = _table(way, station)
     part = (station.unsqueeze(-1) - table.station).clamp(min=0).minimum(table.length)
     return (part * table.curvature).sum(-1)
 
 
 def _curved(way: Way, first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
     """The least and the largest curvature between two stations [...]."""
-    table = Table(*(column.to(first) for column in _table(way)))
+    table = _table(way, first)
     first, last = first.unsqueeze(-1), last.unsqueeze(-1)
     touched = (last >= table.station + table.begin) & (first <= table.station + table.end)
     return _within(table.curvature.expand_as(touched), touched)
@@ -331,7 +336,7 @@ def _straightened(car: Kinematics, measured: Boxes, states: Tensor) -> Boxes:
     slowest = (low[..., 2:] + velocity - ROUNDING).clamp(min=-car.top_speed)
     fastest = (high[..., 2:] + velocity + ROUNDING).clamp(max=car.top_speed)
     found = enclosed(way, car.lane_width, least, most)
-    table = Table(*(column.to(low) for column in _table(way)))
+    table = _table(way, low)
     first, last = (table.heading + table.curvature * bound for bound in found.along)
     speeds = projected(slowest, fastest, torch.minimum(first, last), torch.maximum(first, last))
     begins, ends = (table.station + bound - station[..., None, None] for bound in found.along)
