@@ -17,6 +17,7 @@ from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.ego import DeadReckoning, predicted
 from cavbench.driving.intervals.kernels import Flags, Floats
 from cavbench.driving.intervals.mask import compilable
+from cavbench.driving.intervals.repeats import distinct
 
 
 class Belief:
@@ -73,11 +74,14 @@ class Belief:
             pessimism: weight of the least answer; the rest is on the middle's.
             network: the network of the policy behind.
         """
-        given = observation, assumed, tracks, ego, signs, pessimism, self, network
+        given = signs, pessimism, self, network
         if torch.is_grad_enabled() and observation.requires_grad:
-            scores: Tensor = _Score.apply(*given)
+            scores: Tensor = _Score.apply(observation, assumed, tracks, ego, *given)
             return scores
-        return _score(*given, sloped=False)[0]
+        if one := distinct(observation, tracks, ego):
+            found = _score(one.observation, assumed, one.tracks, one.ego, *given, sloped=False)[0]
+            return found[one.place].view(*observation.shape[:-2], network.outputs)
+        return _score(observation, assumed, tracks, ego, *given, sloped=False)[0]
 
     def believe(
         self, shown: Floats, there: Flags, ego: Tensor, low: Floats, high: Floats, signs: Tensor
