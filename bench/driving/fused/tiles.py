@@ -142,9 +142,7 @@ def pool(context: Any, response: Any, present: Any, start: Any, number: Any, bes
         start, p = given[2], given[6]
         found = builder.fmul(responses.load(p, start), there.load(_SIZE(0), start))
         before = most.load(p, start)
-        larger = builder.or_(
-            builder.fcmp_ordered(">", found, before), builder.fcmp_unordered("!=", found, found)
-        )
+        larger = builder.or_(builder.fcmp_ordered(">", found, before), builder.fcmp_unordered("!=", found, found))
         spread = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), given[3], ir.IntType(32)(0))
         same = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
         spread = builder.shuffle_vector(spread, ir.Constant(_VECTOR, ir.Undefined), same)

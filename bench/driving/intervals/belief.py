@@ -156,7 +156,8 @@ def _score(
     answers, behind = network.forward(torch.from_numpy(points), keeps=False)
     values, scores = answers.numpy(), np.empty((len(shown), network.outputs), np.float32)
     belief_kernels.least(values, weight, scores)
-    return torch.from_numpy(scores).view(*observation.shape[:-2], network.outputs), (slopes, kept, behind, values, weight)
+    shape = *observation.shape[:-2], network.outputs
+    return torch.from_numpy(scores).view(shape), (slopes, kept, behind, values, weight)
 
 
 class _Score(torch.autograd.Function):

@@ -57,10 +57,10 @@ def _words(values: NDArray[Any]) -> Words:
 
 @inner
 def _same(values: Words, one: int, other: int) -> bool:
-    for k in range(values.shape[1]):
-        if values[one, k] != values[other, k]:
-            return False
-    return True
+    k = 0
+    while k < values.shape[1] and values[one, k] == values[other, k]:
+        k += 1
+    return k == values.shape[1]
 
 
 @entry_point
