@@ -130,7 +130,7 @@ class Rates:
         episode: of each episode in it.
         unknown: its components whose cost nobody measured.
         length: mean length of an episode, as a share of all steps.
-        alone: whether each unit is a batch of its own, because the victim is random.
+        alone: whether each unit is a batch of its own, because the victim's answers depend on the batch.
     """
 
     artefact: float
@@ -198,7 +198,10 @@ def rates(pair: Pair) -> Rates:
     batch = here["batch"] + max(batch - usual["batch"], 0.0) * times
     episode = here["episode"] + max(episode - usual["episode"], 0.0) * times
     length = _of_row(rows, own, attack, "length") or 1.0
-    alone = any(costs.get("alone") for costs in rows.get(own, {}).values())
+    # Answers may be the same in every batch, and gradients not.
+    asks = "pgd" if pair.attack.component.access in ("gradients", "dynamics") else "none"
+    costs = rows.get(own, {})
+    alone = bool(costs.get(attack, costs.get(asks, {})).get("alone"))
     return Rates(0.0, batch, episode, tuple(unknown), _there(length, usual, here), alone)
 
 

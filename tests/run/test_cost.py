@@ -79,6 +79,18 @@ def test_units_that_are_driven_alone_share_nothing(alone: bool, monkeypatch: pyt
     assert seconds < 1.001 * units * own.of(2)
 
 
+def test_a_memory_is_driven_alone_only_where_its_gradients_are_asked_for() -> None:
+    """They depend on the batch, its answers do not; `plan` was not measured behind `atla`."""
+    words = ("defense=atla", "threat.access=dynamics", "reference=false")
+    pairs = {name: plan_of([f"attack={name}", *words]).pairs[0] for name in ("noise", "zo", "pgd", "plan")}
+    assert {name: rates(pair).alone for name, pair in pairs.items()} == {
+        "noise": False,
+        "zo": False,
+        "pgd": True,
+        "plan": True,
+    }
+
+
 def test_what_nobody_measured_is_said() -> None:
     assert "a guess, because nobody measured nudge" in str(plan_of(["attack=nudge", *SHORT]).cost)
 
