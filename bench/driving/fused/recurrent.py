@@ -19,7 +19,7 @@ from cavbench.driving.fused.network import Fused, Room
 
 @rounded_once
 def sigmoid(x: np.float32) -> np.float32:
-    """1 / (1 + exp(-x)) = (1 + tanh(x / 2)) / 2, to about 1e-7; 0 and 1 at the infinities, as in torch."""
+    """1 / (1 + exp(-x)) = (1 + tanh(x / 2)) / 2, to about 2e-7; 0 and 1 far out, as in torch."""
     half = np.float32(0.5)
     found = half + half * tanh(half * x)
     found = np.float32(0) if x < -18 else found
