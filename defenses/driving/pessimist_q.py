@@ -13,10 +13,11 @@ from torch import Tensor
 from cavbench.core.ranges import Count, Share
 from cavbench.driving import DrivingDefense, DrivingFacts, DrivingVictim, Policy, State
 from cavbench.driving.intervals.belief import Belief
-from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.boxes import Assumed, Boxes
 from cavbench.driving.intervals.ego import Ego, Step
 from cavbench.driving.intervals.policy import IntervalPolicy, remembers, with_inner
 from cavbench.driving.threat import Norm
+from cavbench.driving.victims.networks import compiled
 from cavbench.errors import UserError
 
 SEED = 0
@@ -65,6 +66,16 @@ class Believing(IntervalPolicy):
     def initial(self, episodes: Tensor) -> State:
         own = {"ego": self.reckoning.unknown(episodes)}
         return with_inner(own, self.policy.initial(episodes), episodes.shape)
+
+    def answered(self, observation: Tensor, assumed: Assumed, tracks: Tensor | None, state: State) -> Tensor:
+        assert state is not None
+        network = compiled(self.policy, observation)
+        # What weighs otherwise does not ask for the least answers of a network.
+        if network is None or type(self).weighed is not Believing.weighed or not self.compiled.fits(observation, state):
+            return super().answered(observation, assumed, tracks, state)
+        signs = _signs(self.settings.corners, observation.shape[-2], observation.shape[-1] - 1)
+        of = assumed, tracks, state["ego"], signs, self.settings.pessimism
+        return self.compiled.scores(observation, *of, network)
 
     def weighed(self, observation: Tensor, boxes: Boxes, state: State) -> Tensor:
         assert state is not None

@@ -150,41 +150,32 @@ def _encode(
     Args:
         layer: the ego's features and the largest responses [features - 1 + pooled, lanes], filled.
         best, chosen: each largest response, at least 0, and the row of its car or `NOBODY`, [pooled, lanes], filled.
-        work: room for `features + 2 * width + pooled` rows.
+        work: room for `features + 2 * (width + pooled)` rows.
     """
     size, width, pooled = form.features, form.width, form.pooled
     car, ego = 0, width * size + width
     pair = ego + width * (size - 1)
     x, own, hidden = work[:size], work[size : size + width], work[size + width : size + 2 * width]
-    response = work[size + 2 * width : size + 2 * width + pooled]
+    response, bias = work[size + 2 * width : size + 2 * width + pooled], work[size + 2 * width + pooled :]
+    used = np.empty(max(size, width) + 1, np.int64)
     read(points, start, count, 1, lanes, layer[: size - 1])
     fill(own, weights, car + width * size, lanes)
+    fill(bias, weights, pair + pooled * width, lanes)
     tiles.add(layer[: size - 1], weights, ego, size - 1, 1, size - 1, width, own, lanes)
     for p in range(pooled):
         for n in range(lanes):
             best[p, n], chosen[p, n] = np.float32(0), np.float32(NOBODY)
     for row in range(1, form.rows):
         read(points, start, count, row * size, lanes, x)
-        absent = True
-        for n in range(count):
-            absent &= x[0, n] == 0
-        if absent:
-            # Its responses are 0, and so is the least of the largest.
-            continue
-        for j in range(width):
-            for n in range(lanes):
-                hidden[j, n] = own[j, n]
-        tiles.add(x, weights, car, size, 1, size, width, hidden, lanes)
-        _activate(hidden, RELU, lanes)
-        fill(response, weights, pair + pooled * width, lanes)
-        tiles.add(hidden, weights, pair, width, 1, width, pooled, response, lanes)
         number = np.float32(row)
-        for p in range(pooled):
-            for n in range(lanes):
-                found, most, whose = response[p, n] * x[0, n], best[p, n], chosen[p, n]
-                larger = (found > most) | (found != found)
-                best[p, n] = found if larger else most
-                chosen[p, n] = number if larger else whose
+        for first in range(0, lanes, tiles.WIDTH):
+            if tiles.empty(x, first, used):
+                # Its responses are 0, and so is the least of the largest.
+                continue
+            tiles.part(x, weights, car, size, 1, size, width, own, hidden, first, used, True)
+            tiles.part(hidden, weights, pair, width, 1, width, pooled, bias, response, first, used, False)
+            for p in range(pooled):
+                tiles.pool(response, x, first, number, best, chosen, p)
     for p in range(pooled):
         for n in range(lanes):
             layer[size - 1 + p, n] = best[p, n]
@@ -216,7 +207,7 @@ def forward(
         best, chosen: as of `_encode`, [blocks, pooled, LANES].
     """
     size, keeps = form.features, len(kept) > 1
-    work = np.empty((size + 2 * form.width + form.pooled, LANES), np.float32)
+    work = np.empty((size + 2 * (form.width + form.pooled), LANES), np.float32)
     head = 0
     if form.width:
         head = form.width * 2 * size + form.pooled * (form.width + 1)

@@ -23,6 +23,10 @@ ir = cgutils.ir
 """LLVM's language, of the version that numba itself writes."""
 _VECTOR = ir.VectorType(ir.FloatType(), WIDTH)
 _SIZE = ir.IntType(64)
+_ZERO = ir.Constant(_VECTOR, [0.0] * WIDTH)
+
+Floats = NDArray[np.float32]
+Sizes = NDArray[np.int64]
 
 
 class _Rows:
@@ -56,9 +60,8 @@ def _used(context: Any, x: Any, inputs: Any, start: Any, used: Any) -> Any:
     def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
         rows, numbers = _Rows(context, builder, x, given[0]), _flat(context, builder, used, given[3])
         count = cgutils.alloca_once_value(builder, _SIZE(0))
-        zero = ir.Constant(_VECTOR, [0.0] * WIDTH)
         with cgutils.for_range(builder, given[1]) as loop:
-            other = builder.fcmp_unordered("!=", rows.load(loop.index, given[2]), zero)
+            other = builder.fcmp_unordered("!=", rows.load(loop.index, given[2]), _ZERO)
             some = builder.icmp_unsigned("!=", builder.bitcast(other, ir.IntType(WIDTH)), ir.IntType(WIDTH)(0))
             at = builder.load(count)
             builder.store(loop.index, builder.gep(numbers, [at]))
@@ -68,8 +71,8 @@ def _used(context: Any, x: Any, inputs: Any, start: Any, used: Any) -> Any:
     return types.int64(x, types.int64, types.int64, used), build
 
 
-def _tile(height: int) -> Any:
-    """The intrinsic that adds to a tile of so many outputs."""
+def _tile(height: int, *, rectified: bool) -> Any:
+    """The intrinsic that adds to a tile of so many outputs; what is below 0 becomes 0 if it is `rectified`."""
 
     @intrinsic
     def add(
@@ -82,61 +85,125 @@ def _tile(height: int) -> Any:
         at: Any,
         across: Any,
         along: Any,
+        first: Any,
         y: Any,
         j: Any,
     ) -> Any:
         def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
-            shown, start, numbers, count, factors, at, across, along, sums, j = given
+            shown, start, numbers, count, factors, at, across, along, begun, sums, j = given
             rows, results = _Rows(context, builder, x, shown), _Rows(context, builder, y, sums)
+            before = _Rows(context, builder, first, begun)
             numbers, factors = _flat(context, builder, used, numbers), _flat(context, builder, weights, factors)
             wide = ir.FunctionType(_VECTOR, [_VECTOR] * 3)
             once = cgutils.get_or_insert_function(builder.module, wide, f"llvm.fmuladd.v{WIDTH}f32")
             same = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
             places = [builder.add(j, _SIZE(number)) for number in range(height)]
-            held = [cgutils.alloca_once_value(builder, results.load(place, start)) for place in places]
+            held = [cgutils.alloca_once_value(builder, before.load(place, start)) for place in places]
             firsts = [builder.add(at, builder.mul(place, across)) for place in places]
             with cgutils.for_range(builder, count) as loop:
                 k = builder.load(builder.gep(numbers, [loop.index]))
                 values, step = rows.load(k, start), builder.mul(k, along)
-                for first, sum_ in zip(firsts, held, strict=True):
-                    factor = builder.load(builder.gep(factors, [builder.add(first, step)]))
+                for place, sum_ in zip(firsts, held, strict=True):
+                    factor = builder.load(builder.gep(factors, [builder.add(place, step)]))
                     spread = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), factor, ir.IntType(32)(0))
                     spread = builder.shuffle_vector(spread, ir.Constant(_VECTOR, ir.Undefined), same)
                     builder.store(builder.call(once, [spread, values, builder.load(sum_)]), sum_)
             for place, sum_ in zip(places, held, strict=True):
-                builder.store(builder.load(sum_), results.at(place, start), align=4)
+                found = builder.load(sum_)
+                if rectified:
+                    found = builder.select(builder.fcmp_ordered("<", found, _ZERO), _ZERO, found)
+                builder.store(found, results.at(place, start), align=4)
             return context.get_dummy_value()
 
         number = types.int64
-        return types.void(x, number, used, number, weights, number, number, number, y, number), build
+        return types.void(x, number, used, number, weights, number, number, number, first, y, number), build
 
     return add
 
 
-_high, _low = _tile(HEIGHT), _tile(1)
+_high, _low = _tile(HEIGHT, rectified=False), _tile(1, rectified=False)
+_high_rectified, _low_rectified = _tile(HEIGHT, rectified=True), _tile(1, rectified=True)
+
+
+@intrinsic
+def pool(context: Any, response: Any, present: Any, start: Any, number: Any, best: Any, chosen: Any, p: Any) -> Any:
+    """Compare a response of the car `number` with the largest one before it, at the points of a tile.
+
+    The response counts times the first row of `present`. Where it is larger, or NaN, it becomes the largest one, `best`, and
+    its car the `chosen` one.
+    """
+
+    def build(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+        kinds = (response, present, best, chosen)
+        arrays = (given[0], given[1], given[4], given[5])
+        responses, there, most, whose = (
+            _Rows(context, builder, kind, array) for kind, array in zip(kinds, arrays, strict=True)
+        )
+        start, p = given[2], given[6]
+        found = builder.fmul(responses.load(p, start), there.load(_SIZE(0), start))
+        before = most.load(p, start)
+        larger = builder.or_(builder.fcmp_ordered(">", found, before), builder.fcmp_unordered("!=", found, found))
+        spread = builder.insert_element(ir.Constant(_VECTOR, ir.Undefined), given[3], ir.IntType(32)(0))
+        same = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
+        spread = builder.shuffle_vector(spread, ir.Constant(_VECTOR, ir.Undefined), same)
+        builder.store(builder.select(larger, found, before), most.at(p, start), align=4)
+        builder.store(builder.select(larger, spread, whose.load(p, start)), whose.at(p, start), align=4)
+        return context.get_dummy_value()
+
+    number_kind = types.float32
+    return types.void(response, present, types.int64, number_kind, best, chosen, types.int64), build
 
 
 @rounded_once
-def add(
-    x: NDArray[np.float32],
-    weights: NDArray[np.float32],
+def part(
+    x: Floats,
+    weights: Floats,
     at: int,
     by_output: int,
     by_input: int,
     inputs: int,
     outputs: int,
-    y: NDArray[np.float32],
-    lanes: int,
+    first: Floats,
+    y: Floats,
+    start: int,
+    used: Sizes,
+    rectified: bool,
+) -> None:
+    """y = first + w @ x, as `add`, at the `WIDTH` points from `start` on, and without what is below 0 if it is `rectified`.
+
+    Args:
+        first: what each sum begins with, as y.
+        used: room for one number more than there are inputs.
+    """
+    whole = outputs - outputs % HEIGHT
+    count = _used(x, inputs, start, used)
+    if rectified:
+        for j in range(0, whole, HEIGHT):
+            _high_rectified(x, start, used, count, weights, at, by_output, by_input, first, y, j)
+        for j in range(whole, outputs):
+            _low_rectified(x, start, used, count, weights, at, by_output, by_input, first, y, j)
+    else:
+        for j in range(0, whole, HEIGHT):
+            _high(x, start, used, count, weights, at, by_output, by_input, first, y, j)
+        for j in range(whole, outputs):
+            _low(x, start, used, count, weights, at, by_output, by_input, first, y, j)
+
+
+@rounded_once
+def empty(x: Floats, start: int, used: Sizes) -> bool:
+    """Whether the first row of x is 0 at all of the `WIDTH` points from `start` on; `used` has room for two numbers."""
+    return _used(x, 1, start, used) == 0
+
+
+@rounded_once
+def add(
+    x: Floats, weights: Floats, at: int, by_output: int, by_input: int, inputs: int, outputs: int, y: Floats, lanes: int
 ) -> None:
     """As `kernels.add`, for a multiple of `WIDTH` lanes.
 
     An input that is 0 at all points of a tile changes no sum and is left out: after a ReLU half of them, where the points are
     near each other, as those of a belief are.
     """
-    used, whole = np.empty(inputs + 1, np.int64), outputs - outputs % HEIGHT
+    used = np.empty(inputs + 1, np.int64)
     for start in range(0, lanes, WIDTH):
-        count = _used(x, inputs, start, used)
-        for j in range(0, whole, HEIGHT):
-            _high(x, start, used, count, weights, at, by_output, by_input, y, j)
-        for j in range(whole, outputs):
-            _low(x, start, used, count, weights, at, by_output, by_input, y, j)
+        part(x, weights, at, by_output, by_input, inputs, outputs, y, y, start, used, False)

@@ -6,6 +6,8 @@ from contextlib import AbstractContextManager
 from dataclasses import replace
 from unittest.mock import patch
 
+import numpy as np
+import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -84,6 +86,35 @@ def test_gradients_are_those_of_torch(seed: int, any_start: bool, network: bool)
     shown, state = drawn(seed, 200)
     _, largest = has_the_gradient_of_torch(policy.scores, shown, state, seed, by_torch, floor=0.1)
     assert float(largest.median()) > 0.01
+
+
+@pytest.mark.parametrize("pessimism", [0.0, 0.7, 1.0])
+def test_the_least_value_and_its_gradient_are_those_of_torch_to_the_last_bit(pessimism: float) -> None:
+    generator = torch.Generator().manual_seed(1)
+    # Few different values: the least one is often shared by several points.
+    values = torch.randint(-3, 9, (50, 16, 5), generator=generator).div(7).requires_grad_()
+    by_scores = torch.randn(50, 5, generator=generator)
+    middle, lowest = values[:, 0], values.amin(1)
+    expected = middle + pessimism * (lowest - middle)
+    (slope,) = torch.autograd.grad(expected, values, by_scores)
+    given, weight = values.detach().numpy(), np.float32(pessimism)
+    scores, by_values = np.empty((50, 5), np.float32), np.empty((50, 16, 5), np.float32)
+    belief_kernels.least(given, weight, scores)
+    belief_kernels.least_backward(by_scores.numpy(), given, weight, by_values)
+    assert torch.equal(torch.from_numpy(scores), expected)
+    assert torch.equal(torch.from_numpy(by_values), slope)
+    assert bool(((values == lowest.unsqueeze(1)).sum(1) > 1).any())
+
+
+def test_a_value_that_is_nan_is_the_least() -> None:
+    values = np.zeros((2, 16, 5), np.float32)
+    values[0, 3, 1] = values[1, 0, 2] = np.nan
+    scores, by_values = np.empty((2, 5), np.float32), np.empty_like(values)
+    belief_kernels.least(values, np.float32(1), scores)
+    belief_kernels.least_backward(np.ones((2, 5), np.float32), values, np.float32(1), by_values)
+    where = np.argwhere(np.isnan(scores)).tolist()
+    assert where == [[0, 1], [1, 2]]
+    assert np.isnan(by_values).any(1).tolist() == np.isnan(scores).tolist()
 
 
 def test_a_row_has_the_same_bits_in_every_batch_and_place() -> None:
