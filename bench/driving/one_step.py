@@ -19,7 +19,7 @@ from cavbench.driving.policy import Policy
 from cavbench.driving.threat import ObservationThreat
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.isolation.streams import Stream
+from cavbench.isolation.streams import Stream, put_back
 from cavbench.isolation.watch import Watch
 from cavbench.scenarios import Cell
 
@@ -100,11 +100,16 @@ class Session:
         self._stream = Stream("victim", seed)
 
     def show(self, observation: Tensor) -> tuple[Shown, Tensor, Tensor]:
-        """Attack observations [B, V, F]: what the victim is shown, and its decisions on the truth and on that."""
+        """Attack observations [B, V, F]: what the victim is shown, and its decisions on the truth and on that.
+
+        A random victim draws the same for both.
+        """
         running = torch.ones(len(observation), dtype=torch.bool)
         with torch.no_grad(), self._stream.in_use(), self.watch:
             shown = self.attacker.show(observation, running, self.state)
-            clean, taken = (self.subject.decided(one, self.state) for one in (observation, shown.observation))
+            with put_back():
+                clean = self.subject.decided(observation, self.state)
+            taken = self.subject.decided(shown.observation, self.state)
         return shown, clean, taken
 
     def advance(self, shown: Tensor, action: Tensor) -> None:
