@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cavbench.core import sets
 from cavbench.core.pair import Pair
 from cavbench.driving.attacker import Attacker, Shown
 from cavbench.driving.contracts import DrivingWorld
@@ -25,6 +26,8 @@ from cavbench.scenarios import Cell
 
 ROUNDING = 1e-5
 """A share of a range may be so far outside of [-1, 1]."""
+DONE = ("actuator", "traffic", "dynamics")
+"""Sets of a threat model that change what cars do, which nobody who looks at observations alone can carry out."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +72,7 @@ class Session:
         seed: of the attack's random numbers.
 
     Raises:
-        UserError: if the threat model does not allow what the attack needs.
+        UserError: if the threat model does not allow what the attack needs, or has a set that only a run carries out.
     """
 
     def __init__(self, pair: Pair, policy: Policy, cells: Sequence[Cell], seed: int = 0) -> None:
@@ -77,6 +80,11 @@ class Session:
         threat: Any = pair.threat
         assert isinstance(world, DrivingWorld)
         assert isinstance(threat, ObservationThreat)
+        if beyond := [name for name in sets.present(threat) if name in DONE]:
+            raise UserError(
+                f"threat.{beyond[0]} changes what cars do, not what is observed: only a run carries it out "
+                "(cavbench.score or bench run)"
+            )
         self.facts, self.policy = world.facts, policy
         attack: Any = None if pair.is_clean else pair.armed(0)
         knows = attack is not None and attack.access == "dynamics"

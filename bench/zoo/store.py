@@ -112,8 +112,8 @@ def save(
         halved = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
         if large := [key for key, value in halved.items() if bool((value.isinf() & state[key].isfinite()).any())]:
             raise UserError(
-                f"training {recipe.name}, seed {seed} ended with more than half precision holds (65504) in {large[0]!r}: nothing is "
-                "saved; try a lower learning rate"
+                f"training {recipe.name}, seed {seed} ended with more than half precision holds (65504) in {large[0]!r}: "
+                "nothing is saved; try a lower learning rate"
             )
         state = halved
     blob = save_tensors(state)

@@ -103,3 +103,21 @@ def test_what_is_wrong_is_one_line(options: dict[str, Any], line: str) -> None:
     given: dict[str, Any] = {"attack": "noise", "policy": torch.nn.Linear(4, 2)} | options
     with pytest.raises(cavbench.UserError, match=line):
         cavbench.gym.AttackedEnv(gymnasium.make("CartPole-v1"), **given).reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "name", "allowed"),
+    [
+        ("lost", "actuator", {"replaced": 0.5}),
+        ("rude", "dynamics", {"time_gap": 0.6, "braking": 7.0, "lane_gain": 0.0, "imposed_braking": 5.0}),
+    ],
+)
+def test_a_set_that_changes_what_cars_do_is_refused(mode: Any, name: str, allowed: dict[str, float]) -> None:
+    """Nothing would be attacked: the environment drives on as it is."""
+    fault, line = cavbench.component("attack", "fault", mode=mode), f"threat.{name} changes what cars do"
+    env = cavbench.gym.make("highway", **CELL)
+    seen, _ = env.reset(seed=0)
+    with pytest.raises(cavbench.UserError, match=line):
+        cavbench.gym.AttackedEnv(env, fault, "dqn", threat={name: allowed}).reset(seed=0)
+    with pytest.raises(cavbench.UserError, match=line):
+        cavbench.attack(fault, "dqn", seen, threat={name: allowed}, **CELL)
