@@ -20,6 +20,7 @@ from cavbench.driving.policy import Policy
 from cavbench.driving.threat import ObservationThreat
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
+from cavbench.isolation.modes import usual
 from cavbench.isolation.streams import Stream, put_back
 from cavbench.isolation.watch import Watch
 from cavbench.scenarios import Cell
@@ -107,6 +108,7 @@ class Session:
         self.state = self.subject.initial(torch.arange(len(cells)))
         self._stream = Stream("victim", seed)
 
+    @usual()
     def show(self, observation: Tensor) -> tuple[Shown, Tensor, Tensor]:
         """Attack observations [B, V, F]: what the victim is shown, and its decisions on the truth and on that.
 
@@ -120,6 +122,7 @@ class Session:
             taken = self.subject.decided(shown.observation, self.state)
         return shown, clean, taken
 
+    @usual()
     def advance(self, shown: Tensor, action: Tensor) -> None:
         """Tell a policy with a memory what it was shown and what was done."""
         with torch.no_grad(), self._stream.in_use(), self.watch:

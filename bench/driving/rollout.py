@@ -111,6 +111,8 @@ def rollout(
     several = len(set(salts)) > 1
     victims_draws, attacks_draws = Stream("victim", salts[0]), Stream("attack", salts[0])
     with (
+        # Without it a caller's inference mode leaves no gradient to an attack.
+        torch.inference_mode(False),
         torch.no_grad(),
         victims_draws.in_use(),
         unchanged({type(attack).__name__: attack} if attack else {}, "attack"),

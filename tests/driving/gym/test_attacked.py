@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 import cavbench
 from cavbench.driving import Policy
+from tests.isolation.torch_modes import CALLERS
 
 CELL: dict[str, Any] = {"lanes": 3, "density": 1, "weather": "clear"}
 
@@ -121,3 +122,19 @@ def test_a_set_that_changes_what_cars_do_is_refused(mode: Any, name: str, allowe
         cavbench.gym.AttackedEnv(env, fault, "dqn", threat={name: allowed}).reset(seed=0)
     with pytest.raises(cavbench.UserError, match=line):
         cavbench.attack(fault, "dqn", seen, threat={name: allowed}, **CELL)
+
+
+@pytest.mark.parametrize("mode", CALLERS)
+def test_a_training_in_a_mode_of_torch_is_attacked_as_without(mode: str) -> None:
+    """Libraries collect episodes in inference mode, in which an attack had no gradient."""
+
+    def shown() -> list[Any]:
+        env = cavbench.gym.AttackedEnv(cavbench.gym.make("highway", max_steps=4, **CELL), pgd(), "dqn")
+        return [env.reset(seed=4), *(env.step(1) for _ in range(3))]
+
+    wanted = shown()
+    with CALLERS[mode]():
+        found = shown()
+    for (seen, *_, info), (other, *_, about) in zip(wanted, found, strict=True):
+        assert info["attack"]["gradients"] == about["attack"]["gradients"] > 0
+        assert (seen == other).all()
