@@ -116,6 +116,9 @@ class Session:
         """
         running = torch.ones(len(observation), dtype=torch.bool)
         with torch.no_grad(), self._stream.in_use(), self.watch:
+            if not self.attacker.begun:
+                # As in a run: is it random? Then an attack asks several times about each point.
+                self.subject.aside(observation, self.state)
             shown = self.attacker.show(observation, running, self.state)
             with put_back():
                 clean = self.subject.decided(observation, self.state)

@@ -11,6 +11,7 @@ import torch
 
 import cavbench
 from cavbench.driving import ObservationThreat
+from cavbench.driving.access import DRAWS
 from cavbench.isolation.modes import numbers, stacked
 from tests.isolation.torch_modes import CALLERS
 
@@ -110,3 +111,8 @@ def test_what_the_caller_has_switched_on_changes_no_answer(mode: str, observed: 
     assert (wanted.observation != observed).any()
     assert (found.observation == wanted.observation).all()
     assert (found.clean == wanted.clean).all()
+
+
+def test_a_random_victim_is_asked_several_times_about_each_point_as_in_a_run(observed: Any) -> None:
+    once, often = (cavbench.attack(PGD, "dqn", observed, defense=defense) for defense in ("none", "smoothing"))
+    assert (often.queries == DRAWS * once.queries).all()

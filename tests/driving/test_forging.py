@@ -233,6 +233,23 @@ def test_commands_are_executed_late() -> None:
     assert executed == [0, 0, 0, 1, 2]
 
 
+def test_the_coin_of_a_frame_is_the_same_whether_or_not_the_attack_answered_before() -> None:
+    def replaced(answers: Callable[[int], bool]) -> list[bool]:
+        steps = iter(range(60))
+        attacker = at_work(
+            lambda o, _: Forgery(action=ages(4)) if answers(next(steps)) else Forgery(), actuator={"replaced": 0.3}
+        )
+        found = []
+        for step in range(60):
+            show(attacker, step % 7)
+            found.append(bool((attacker.execute(torch.zeros(BATCH, dtype=torch.int64)) == 4)[0]))
+        return found
+
+    always, late = replaced(lambda step: True), replaced(lambda step: step >= 20)
+    assert 5 < sum(always) < 30
+    assert late == [False] * 20 + always[20:]
+
+
 def test_the_run_tosses_the_coin_of_the_probabilistic_action_robust_process() -> None:
     attacker = at_work(lambda o, _: Forgery(action=ages(4)), actuator={"replaced": 0.3})
     replaced = []
