@@ -163,11 +163,11 @@ class Meter:
 
     def _changed(self, rows: Tensor, clean: Tensor, action: Tensor) -> NDArray[np.float64]:
         """[B] 1 where the attack changed the victim's decision; arguments as `unattacked` returns them."""
-        changed, taken = np.zeros(len(action)), action[rows]
+        changed, taken, places = np.zeros(len(action)), action[rows], rows.numpy()
         if self.subject.action_type == "discrete":
-            changed[rows] = (clean != taken).numpy()
+            changed[places] = (clean != taken).numpy()
         elif len(rows):
-            changed[rows] = ((clean - taken).abs().amax(-1) > CHANGED).numpy()
+            changed[places] = ((clean - taken).abs().amax(-1) > CHANGED).numpy()
         return changed
 
     def columns(self) -> Columns:

@@ -17,6 +17,7 @@ from cavbench.driving.one_step import Session
 from cavbench.driving.rollout import Trace, rollout
 from tests.driving import cheats
 from tests.driving.cheats import Does, Noisy, Victim, drive
+from tests.plugins.toy import ToyPolicy
 
 RANDOM = [lambda: Smoothed(Victim(), 0.3), Noisy]
 
@@ -45,6 +46,19 @@ def test_a_change_of_nothing_changes_no_decision_of_a_random_victim(policy: Any,
     columns = drive(deed, policy())
     assert (columns["linf"] > 0).any()
     assert float(np.max(columns["changed"])) <= 1 / 90
+
+
+@pytest.mark.parametrize("kind", ["discrete", "continuous"])
+@pytest.mark.parametrize("count", [0, 1, 2, 8])
+def test_only_the_episodes_that_were_attacked_count(kind: Any, count: int) -> None:
+    def deed(observation: Tensor, oracle: Oracle) -> Tensor:
+        moved = _much(observation, oracle)
+        moved[count:] = observation[count:]
+        return moved
+
+    changed = drive(deed, ToyPolicy(kind, 0).eval(), budget=1.9)["changed"]
+    assert (changed[:count] > 0).all()
+    assert (changed[count:] == 0).all()
 
 
 @pytest.mark.parametrize("policy", [Victim, *RANDOM])
