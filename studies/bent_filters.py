@@ -33,7 +33,9 @@ def measured(pair: str, attack: str, scenarios: int, first: int, road: str) -> s
     home = {"decisions": 12000, "trained_in": road} if name == "dqn" else {}
     victim = choose("victim", name, **home).component
     facts = world.facts
-    policy = victim.load(0, facts) if filtered == "none" else choose("defense", filtered).component.load(victim, 0, facts)
+    policy = (
+        victim.load(0, facts) if filtered == "none" else choose("defense", filtered).component.load(victim, 0, facts)
+    )
     cells = [world.axes.cell(density=density) for density in DENSITIES for _ in range(scenarios // 2)]
     start = time.process_time()
     found = rollout(
@@ -62,7 +64,10 @@ def main() -> None:
     parser.add_argument("--road", default="u_turn")
     given = parser.parse_args()
     settle()
-    print("| victim | filter | attack | safe progress | crashed | assured | CPU s |\n|---|---|---|---|---|---|---|", flush=True)
+    print(
+        "| victim | filter | attack | safe progress | crashed | assured | CPU s |\n|---|---|---|---|---|---|---|",
+        flush=True,
+    )
     for attack in given.attacks:
         for pair in given.pairs:
             print(measured(pair, attack, given.scenarios, given.first, given.road), flush=True)
