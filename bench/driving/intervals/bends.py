@@ -426,11 +426,11 @@ def _remembered(boxes: Boxes, tracks: Tensor, found: Tensor, way: Way) -> Boxes:
     kept = (tracks[..., 0] > 0) & ~found & hidden & (tracks[..., 1] > 0)
     order = torch.where(kept, tracks[..., 1], torch.inf).sort(stable=True, dim=-1).indices[..., :REMEMBERED]
     rows = tracks.gather(-2, order.unsqueeze(-1).expand(*order.shape, tracks.shape[-1])).clone()
-    rows[..., 4] = rows[..., 8] = -boxes.low[..., :1, 3]
     # Who is not seen, is not where the ego sees everyone: in its bend, unless the rows are full.
-    bent, end = _bend(way, station)
+    bent, end = _bend(way, station.detach())
     seen = torch.where(bent & ~boxes.present[..., -1], end - ROUNDING, -FAR).unsqueeze(-1)
     rows[..., 1], rows[..., 5] = rows[..., 1].maximum(seen), rows[..., 5].maximum(seen)
+    rows[..., 4] = rows[..., 8] = -boxes.low[..., :1, 3]
     return Boxes(
         torch.cat([boxes.present, kept.gather(-1, order)], -1),
         torch.cat([boxes.low, rows[..., 1:5]], -2),
@@ -578,8 +578,8 @@ def predicted(boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, limits:
     ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - slack
     found[..., 1] = low[..., 0] + behind * torch.where(behind >= 0, least, most) - moved.unsqueeze(-1) - slack
     found[..., 5] = high[..., 0] + ahead * torch.where(ahead >= 0, most, least) - moved.unsqueeze(-1) + slack
-    # Cars out of sight, which have no speed across the way, keep their lane, and may brake or gain speed as any car, but for
-    # those that would be in the way where the ego can see.
+    # Cars out of sight, which have no speed across the way, keep their lane, and may brake or gain speed as any car. Where one
+    # would keep the ego from seeing past its bend, it does not stop.
     now = after[:, motion_kernels.SPEED, None], after[:, motion_kernels.HEADING, None]
     unseen = low[..., 3] == high[..., 3]
     braked = absolute[0][..., 1] - float(limits.gained)

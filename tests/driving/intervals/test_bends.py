@@ -223,7 +223,7 @@ def out_of_sight(speed: float) -> tuple[Tracked, Boxes, Tensor]:
     return policy, Boxes(present, low, high), torch.tensor([[0.0, 0.0, 8.0, 0.0, 8.0, 1.0, 1.0, 170.0]])
 
 
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(speed=some.floats(1.5, 8), braking=some.floats(0.5, 6), delay=some.integers(0, 30))
 def test_what_is_remembered_holds_every_car_that_does_not_stop_where_it_is_in_the_way(
     speed: float, braking: float, delay: int
