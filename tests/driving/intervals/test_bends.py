@@ -189,7 +189,7 @@ def test_a_car_that_gets_out_of_sight_is_remembered() -> None:
     assert boxes.present[0, 10:].sum() == 1
     # It may have braked to walking pace, as long as it would be in the way where the ego sees past the end.
     for _ in range(20):
-        step, boxes = one_later(policy, boxes, step.after)
+        step, boxes = one_later(policy, boxes, step.after, torch.tensor([SLOW]))
     assert boxes.present[0, 10:].sum() == 1
     stands, own = float(boxes.low[0, 10, 0] + boxes.low[0, 0, 0]), boxes.low[0, 0, 2]
     assert END < stands < 194
@@ -198,15 +198,15 @@ def test_a_car_that_gets_out_of_sight_is_remembered() -> None:
     assert float(cars_of(moves.now(boxes, step.after), boxes, CAR).low[0, 9, 0]) < stands - float(step.after[0, 7])
     # Farther on it may have stopped.
     for _ in range(120):
-        step, boxes = one_later(policy, boxes, step.after)
+        step, boxes = one_later(policy, boxes, step.after, torch.tensor([SLOW]))
     stands, own = float(boxes.low[0, 10, 0] + boxes.low[0, 0, 0]), boxes.low[0, 0, 2]
     assert END + CAR.length < stands < END + CAR.length + 4
     assert float(boxes.low[0, 10, 2] + own) == pytest.approx(0, abs=1e-4)
 
 
-def one_later(policy: Tracked, boxes: Boxes, state: Tensor) -> tuple[Step, Boxes]:
-    """The ego and the boxes after SLOWER, where nobody is seen."""
-    step = policy.reckoning.step(boxes, state, torch.tensor([SLOW]))
+def one_later(policy: Tracked, boxes: Boxes, state: Tensor, action: Tensor) -> tuple[Step, Boxes]:
+    """The ego and the boxes after an action [1], where nobody is seen."""
+    step = policy.reckoning.step(boxes, state, action)
     tracks = predicted(boxes, *step, CAR, policy.period)
     return step, policy.reckoning.boxes(policy.assumed, alone(step.after), step.after, tracks)
 
@@ -223,42 +223,35 @@ def out_of_sight(speed: float) -> tuple[Tracked, Boxes, Tensor]:
     return policy, Boxes(present, low, high), torch.tensor([[0.0, 0.0, 8.0, 0.0, 8.0, 1.0, 1.0, 170.0]])
 
 
-@settings(max_examples=8, deadline=None)
+def fastest(policy: Tracked, boxes: Boxes, state: Tensor) -> Tensor:
+    """FASTER where the shield allows it, else SLOWER, [1]."""
+    shield = policy.policy
+    assert isinstance(shield, Shielded)
+    allowed = shield.allowed(shield.margins(policy.reckoning.now(boxes, state), boxes))
+    return torch.where(allowed[:, FAST] > 0.5, FAST, SLOW)
+
+
+@settings(max_examples=6, deadline=None)
 @given(speed=some.floats(1.5, 8), braking=some.floats(0.5, 6), delay=some.integers(0, 30))
-def test_what_is_remembered_holds_every_car_that_does_not_stop_where_it_is_in_the_way(
-    speed: float, braking: float, delay: int
-) -> None:
+@pytest.mark.slow
+def test_a_car_out_of_sight_is_not_hit_and_not_waited_for_for_ever(speed: float, braking: float, delay: int) -> None:
+    """It brakes at some moment, in the way to walking pace, farther on to a stop; then the ego comes to where it sees it."""
     policy, boxes, state = out_of_sight(speed)
     true, station, dt = speed, 191.0, policy.period
-    for moment in range(100):
-        step, boxes = one_later(policy, boxes, state)
+    for moment in range(300):
+        step, boxes = one_later(policy, boxes, state, fastest(policy, boxes, state))
         state = step.after
         least = CREEPING if station < END + CAR.length + 3 else 0.0
         slower = max(true - braking * dt, min(least, true)) if moment >= delay else true
         station, true = station + (true + slower) / 2 * dt, slower
+        assert station - float(state[0, 7]) > CAR.length, moment
+        if float(state[0, 7]) > END:
+            break
         rows = boxes.present[0, 10:]
-        assert bool(rows.any())
         low, high = (side[0, 10:][rows] + boxes.low[0, 0] for side in (boxes.low, boxes.high))
         here = (low[:, 0] <= station) & (station <= high[:, 0]) & (low[:, 2] <= true) & (true <= high[:, 2])
         assert bool(here.any()), (moment, station, true)
-
-
-def test_a_car_that_left_the_half_circle_long_ago_is_not_waited_for() -> None:
-    """The ego stops before the end of the half circle, and drives on when the car must have made room."""
-    policy, boxes, state = out_of_sight(4.0)
-    passed = 0
-    for _ in range(200):
-        allowed = policy.policy.allowed(policy.policy.margins(policy.reckoning.now(boxes, state), boxes))
-        best = FAST if allowed[0, FAST] > 0.5 else SLOW
-        step = policy.reckoning.step(boxes, state, torch.tensor([best]))
-        if float(step.after[0, 7]) > END:
-            break
-        tracks = predicted(boxes, *step, CAR, policy.period)
-        state = step.after
-        boxes = policy.reckoning.boxes(policy.assumed, alone(state), state, tracks)
-        passed += 1
-    assert 20 < passed < 180
-    assert float(step.after[0, 2]) < 6
+    assert float(state[0, 7]) > END
 
 
 def test_a_driver_without_intervals_is_shown_the_middles_in_the_frame_of_the_world() -> None:
