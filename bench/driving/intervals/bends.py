@@ -582,13 +582,14 @@ def predicted(boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, limits:
     # would keep the ego from seeing past its bend, it does not stop.
     now = after[:, motion_kernels.SPEED, None], after[:, motion_kernels.HEADING, None]
     unseen = low[..., 3] == high[..., 3]
-    braked = absolute[0][..., 1] - float(limits.gained)
-    creeps = _in_the_way(car, station, low[..., 0]) & (absolute[1][..., 1] >= CREEPING)
-    speeds = [torch.where(creeps, braked.clamp(min=CREEPING), braked.clamp(min=0))]
+    speeds = [(absolute[0][..., 1] - float(limits.gained)).clamp(min=0)]
     speeds.append((absolute[1][..., 1] + float(limits.gained)).clamp(max=car.top_speed))
     for place, side, share in ((2, 0, least), (6, 1, most)):
-        further = (low, high)[side][..., 0] + speeds[side] * share * period - moved.unsqueeze(-1)
-        found[..., place - 1] = torch.where(unseen, further, found[..., place - 1])
+        further = (low, high)[side][..., 0] + speeds[side] * share * period
+        if side == 0:
+            crept = (low[..., 0] + CREEPING * least * period).minimum(_in_the_way(car, station).unsqueeze(-1))
+            further = torch.where(absolute[1][..., 1] >= CREEPING, further.maximum(crept), further)
+        found[..., place - 1] = torch.where(unseen, further - moved.unsqueeze(-1), found[..., place - 1])
         found[..., place + 1] = torch.where(unseen, speeds[side] - now[0] * now[1].cos(), found[..., place + 1])
         found[..., place] = torch.where(
             unseen, absolute[side][..., 0] - after[:, motion_kernels.Y, None], found[..., place]
@@ -608,10 +609,9 @@ def _bend(way: Way, station: Tensor) -> tuple[Tensor, Tensor]:
     return curvature != 0, table.station[number] + seen - station
 
 
-def _in_the_way(car: Kinematics, station: Tensor, ahead: Tensor) -> Tensor:
-    """Whether a car [..., K] so many m ahead of the ego's station [...] would stop it before it sees past its bend, bool."""
+def _in_the_way(car: Kinematics, station: Tensor) -> Tensor:
+    """How far ahead of stations [...] in a bend a car lets the ego come to where it sees past the bend, in m; else -`FAR`."""
     assert car.way is not None
     table, number = _at(car.way, station)
     end = table.station[number] + table.length[number] - station
-    room = end + car.length + lengthened(car) + BLIND
-    return (table.curvature[number] != 0).unsqueeze(-1) & (ahead < room.unsqueeze(-1))
+    return torch.where(table.curvature[number] != 0, end + car.length + lengthened(car) + BLIND, -FAR)
