@@ -45,16 +45,12 @@ def upstream(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float
     found = np.full(x.shape, np.inf)
     ring = np.hypot(x, y) < RING
     found[ring] = (np.remainder(np.arctan2(y, x) - ENTRY, 2 * np.pi) * RADIUS)[ring]
-    # The entries are on the left of each arm as it is seen from above, the exits on the right.
-    for name, place in (("east", (x > 0) & (abs(x) > abs(y)) & (y < 0)), ("north", (y < 0) & (abs(y) > abs(x)) & (x < 0))):
-        found[~ring & place] = (_round(name) + np.hypot(x, y) - OUTER)[~ring & place]
-    west = (x < 0) & (abs(x) > abs(y)) & (y > 0)
-    found[~ring & west] = (_round("west") + np.hypot(x, y) - OUTER)[~ring & west]
+    # The entries are on the left of each arm for those who come, so on one side of its axis.
+    arms = {"east": (x > abs(y)) & (y < 0), "north": (-y > abs(x)) & (x < 0), "west": (-x > abs(y)) & (y > 0)}
+    for name, here in arms.items():
+        on_arm = here & ~ring
+        found[on_arm] = (np.remainder(ARMS[name] - ENTRY, 2 * np.pi) * RADIUS + np.hypot(x, y) - OUTER)[on_arm]
     return found
-
-
-def _round(arm: str) -> float:
-    return float(np.remainder(ARMS[arm] - ENTRY, 2 * np.pi) * RADIUS)
 
 
 @torch.no_grad()
@@ -65,7 +61,8 @@ def main() -> None:
     count = parser.parse_args().scenarios
     settle()
     world, wait = choose("world", "roundabout").component, seconds()
-    print(f"the ego needs {wait:.1f} s\n| density | steady, of the decisions | never | worst, of the decisions | never |\n|---|---|---|---|---|")
+    print(f"the ego needs {wait:.1f} s")
+    print("| density | steady, of the decisions | never | worst, of the decisions | never |\n|---|---|---|---|---|")
     for density in world.axes.cell(density=1.0), world.axes.cell(density=2.0):
         env = world.build([density] * count, Control())
         td = env.reset(TensorDict({"seed": torch.arange(count) + SeedBlock.TUNE}, batch_size=env.batch_size))
