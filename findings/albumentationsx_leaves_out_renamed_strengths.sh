@@ -3,10 +3,10 @@
 # What happens: 17 such words that albumentations 2.0.8 takes are left out with a warning, and the default strength is used: MotionBlur(blur_limit=21)
 # blurs like blur_limit=3. Words that kept their names work, and so do the new names.
 # For whom it matters: a curve over five severities is flat, and a detector looks robust. Warnings of worker processes are easily missed.
-# Versions: albumentationsx 2.5.1 (core/validation.py, ValidatedTransformMeta; `strict=True` makes it an error, albumentations' issue 2307).
+# Versions: albumentationsx 2.5.1, which needs torch (core/validation.py, ValidatedTransformMeta; `strict=True` makes it an error, albumentations' issue 2307).
 # Source: weak and strong calls, with the words of the signatures of albumentations 2.0.8; met while looking at the boxes of blurred cars.
 source "$(dirname "$0")/fresh.sh"
-fresh albumentationsx==2.5.1 opencv-python-headless==5.0.0.93 numpy
+fresh torch==2.13.0 albumentationsx==2.5.1 opencv-python-headless==5.0.0.93 numpy
 see <<'P'
 import warnings
 from importlib.metadata import version
