@@ -1,7 +1,7 @@
 #!/usr/bin/env bash
 # One guesses: an ArUco marker that stands straight in an image, 60 pixels wide, is found straight and 59 or 60 pixels wide, sharp or blurred.
 # What happens: with the default corners a slight blur turns it by 1.9 degrees (a marker of 120 pixels by 1.0), always to the same side. The four
-# refinements give four widths, and those of AprilTag count from the corner of a pixel, all others from its centre.
+# refinements give three widths, and those of AprilTag count from the corner of a pixel, all others from its centre.
 # For whom it matters: a printed patch that is cut out or placed by its marker is turned and half a pixel off, and the attack on it looks weaker.
 # Versions: opencv-python-headless 5.0.0.93 (modules/objdetect, aruco_detector.cpp, ArucoDetector.detectMarkers, CORNER_REFINE_*).
 # Source: a drawn marker under Gaussian blurs, with its true corners beside those found.
@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 WORDS = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
-WAYS = {"none": cv2.aruco.CORNER_REFINE_NONE, "subpix": cv2.aruco.CORNER_REFINE_SUBPIX, "contour": cv2.aruco.CORNER_REFINE_CONTOUR, "apriltag": cv2.aruco.CORNER_REFINE_APRILTAG}
+WAYS = {way: getattr(cv2.aruco, f"CORNER_REFINE_{way.upper()}") for way in ("none", "subpix", "contour", "apriltag")}
 
 
 def found(side, blur, way, number=7):
