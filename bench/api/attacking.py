@@ -12,9 +12,11 @@ from cavbench.core.pair import Pair
 from cavbench.driving import DrivingWorld
 from cavbench.driving.one_step import Attacked, Form, Session
 from cavbench.errors import UserError
+from cavbench.isolation.modes import usual
 from cavbench.scenarios import Value
 
 
+@usual()
 def attack(
     attack: str | Attack,
     policy: Any,

@@ -16,6 +16,7 @@ from cavbench.api.table import Scores, scores_of
 from cavbench.core.contracts import Attack, Defense, ThreatModel, Victim, World
 from cavbench.core.pair import Pair
 from cavbench.errors import UserError
+from cavbench.isolation.modes import usual
 from cavbench.records import reading
 from cavbench.run import runner
 from cavbench.run.plan import Plan
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 By = Literal["pair", "cell"]
 
 
+@usual()
 def score(
     victim: str | Victim | nn.Module | Any = "dqn",
     attack: str | Attack | Sequence[str | Attack] = "standard",

@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
+from cavbench.core import sets
 from cavbench.core.contracts import Access, QueryBudgetError, permit
 from cavbench.driving.dynamics import Dynamics
 from cavbench.driving.features import ActionType, Features
@@ -296,6 +297,7 @@ class Enforcer:
         self._shown = deepcopy(threat), deepcopy(features)
         self.dynamics = deepcopy(dynamics)
         self.forging: Forging | None = None
+        self._forges = bool(sets.present(threat))
         self.asked: list[tuple[Tensor | None, Tensor]] | None = None
         self.rehearsed: tuple[int, Tensor | None] | None = None
         self.orders: Tensor | None = None
@@ -406,9 +408,12 @@ class Enforcer:
         Raises:
             UserError: if a forgery is more than the threat model allows.
         """
-        if isinstance(answer, Forgery):
-            return self.forged.show(answer, self.rows, name)
-        return self._set.project(answer)
+        if not isinstance(answer, Forgery):
+            if not self._forges:
+                return self._set.project(answer)
+            # It shows the newest frame, without forged cars and messages: what is shown after it must follow from that.
+            answer = Forgery(observation=answer)
+        return self.forged.show(answer, self.rows, name)
 
     @property
     def forged(self) -> Forging:

@@ -167,9 +167,10 @@ class Forging:
             return action
         if actuator.delay:
             self.actions = [action.clone(), *self.actions[: actuator.delay]]
+        # In every frame: an attack that answers no action may not keep a coin for later.
+        coin = self._tossed() if actuator.replaced else None
         if forgery is None or (forgery.action is None and forgery.shift is None and forgery.delay is None):
             return action
-        coin = self._tossed() if actuator.replaced and forgery.action is not None else None
         own, rows = action[self.rows], self.rows
         if forgery.delay is not None and actuator.delay:
             kept = torch.stack(self.actions)[:, rows]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import Tensor
@@ -19,6 +18,7 @@ from cavbench.driving.policy import State, rows_of
 from cavbench.driving.strings import Strings
 from cavbench.driving.victim import CountedPolicy
 from cavbench.isolation.modes import kept
+from cavbench.isolation.streams import put_back
 
 CHANGED = 0.1
 """A continuous action counts as changed if it differs by more than this on its [-1, 1] scale."""
@@ -61,14 +61,50 @@ class Meter:
         self.queries: list[NDArray[np.int64]] = []
         self.actions: list[NDArray[np.int64]] = []
 
+    def unattacked(
+        self, truth: Tensor, shown: Shown, driven: Tensor, state: State, numbers: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """Which running episodes the attack changes, int64 [R], and what the victim would decide there without it, [R] or [R, 2].
+
+        A random victim draws for this what it draws while it drives: else its noise would count as a success of the attack. So it
+        is asked before it drives.
+
+        Args:
+            truth: the true observation [B, V, F].
+            shown: the observation that the victim is about to receive.
+            driven: bool [B], the episodes that are running.
+            state: the victim's state before the step.
+            numbers: for the draws of the step, int64 [B].
+        """
+        touched = driven & (shown.observation != truth)[..., 1:].flatten(1).any(1)
+        rows = touched.nonzero().squeeze(1)
+        if not len(rows):
+            return rows, rows
+        # Counted as a question: what an episode draws later stays what it is in the records so far.
+        self.subject.numbers(rows)
+        if self.subject.shares:
+            # The generators of the process know no episode: only the same batch draws the same.
+            with put_back():
+                return rows, self.subject.decided(truth, state, numbers)[rows]
+        own = None if numbers is None else numbers[rows]
+        return rows, self.subject.decided(truth[rows], rows_of(state, rows), own)
+
     def step(
-        self, truth: Tensor, shown: Shown, action: Tensor, driven: Tensor, state: State, after: TensorDictBase
+        self,
+        truth: Tensor,
+        shown: Shown,
+        unattacked: tuple[Tensor, Tensor],
+        action: Tensor,
+        driven: Tensor,
+        state: State,
+        after: TensorDictBase,
     ) -> None:
         """Count one step.
 
         Args:
             truth: the true observation [B, V, F].
             shown: the observation that the victim received, and its cost.
+            unattacked: of this step.
             action: the victim's action.
             driven: bool [B], the episodes that were running before the step.
             state: the victim's state before the step.
@@ -84,7 +120,7 @@ class Meter:
             after["reward"].squeeze(-1).numpy(),
             info["progress"],
             info["speed"],
-            self._changed(truth, action, state, running & (linf > 0)),
+            self._changed(*unattacked, action),
             linf,
             np.sqrt(np.square(offset).sum((1, 2))),
             physical[..., self.positions].max((1, 2), initial=0.0),
@@ -125,17 +161,13 @@ class Meter:
         counted = (used.hidden.numpy(), used.invented.numpy(), used.age.numpy(), acted, used.messages.numpy())
         self.used += np.where(driven.numpy(), np.stack(np.broadcast_arrays(*counted)), 0.0)
 
-    def _changed(self, truth: Tensor, action: Tensor, state: State, touched: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """[B] 1 where the attack changed the victim's decision, which needs a perturbed observation (`touched`, bool [B])."""
-        changed = np.zeros(len(touched))
-        if touched.any():
-            rows = torch.from_numpy(touched)
-            numbers = self.subject.numbers(rows.nonzero().squeeze(1))
-            taken, clean = action[rows], self.subject.decided(truth[rows], rows_of(state, rows), numbers)
-            if self.subject.action_type == "discrete":
-                changed[touched] = (clean != taken).numpy()
-            else:
-                changed[touched] = ((clean - taken).abs().amax(-1) > CHANGED).numpy()
+    def _changed(self, rows: Tensor, clean: Tensor, action: Tensor) -> NDArray[np.float64]:
+        """[B] 1 where the attack changed the victim's decision; arguments as `unattacked` returns them."""
+        changed, taken, places = np.zeros(len(action)), action[rows], rows.numpy()
+        if self.subject.action_type == "discrete":
+            changed[places] = (clean != taken).numpy()
+        elif len(rows):
+            changed[places] = ((clean - taken).abs().amax(-1) > CHANGED).numpy()
         return changed
 
     def columns(self) -> Columns:

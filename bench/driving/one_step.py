@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from cavbench.core import sets
 from cavbench.core.pair import Pair
 from cavbench.driving.attacker import Attacker, Shown
 from cavbench.driving.contracts import DrivingWorld
@@ -19,12 +20,15 @@ from cavbench.driving.policy import Policy
 from cavbench.driving.threat import ObservationThreat
 from cavbench.driving.victim import CountedPolicy
 from cavbench.errors import UserError
-from cavbench.isolation.streams import Stream
+from cavbench.isolation.modes import usual
+from cavbench.isolation.streams import Stream, put_back
 from cavbench.isolation.watch import Watch
 from cavbench.scenarios import Cell
 
 ROUNDING = 1e-5
 """A share of a range may be so far outside of [-1, 1]."""
+DONE = ("actuator", "traffic", "dynamics")
+"""Sets of a threat model that change what cars do, which nobody who looks at observations alone can carry out."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +73,7 @@ class Session:
         seed: of the attack's random numbers.
 
     Raises:
-        UserError: if the threat model does not allow what the attack needs.
+        UserError: if the threat model does not allow what the attack needs, or has a set that only a run carries out.
     """
 
     def __init__(self, pair: Pair, policy: Policy, cells: Sequence[Cell], seed: int = 0) -> None:
@@ -77,6 +81,11 @@ class Session:
         threat: Any = pair.threat
         assert isinstance(world, DrivingWorld)
         assert isinstance(threat, ObservationThreat)
+        if beyond := [name for name in sets.present(threat) if name in DONE]:
+            raise UserError(
+                f"threat.{beyond[0]} changes what cars do, not what is observed: only a run carries it out "
+                "(cavbench.score or bench run)"
+            )
         self.facts, self.policy = world.facts, policy
         attack: Any = None if pair.is_clean else pair.armed(0)
         knows = attack is not None and attack.access == "dynamics"
@@ -99,14 +108,24 @@ class Session:
         self.state = self.subject.initial(torch.arange(len(cells)))
         self._stream = Stream("victim", seed)
 
+    @usual()
     def show(self, observation: Tensor) -> tuple[Shown, Tensor, Tensor]:
-        """Attack observations [B, V, F]: what the victim is shown, and its decisions on the truth and on that."""
+        """Attack observations [B, V, F]: what the victim is shown, and its decisions on the truth and on that.
+
+        A random victim draws the same for both.
+        """
         running = torch.ones(len(observation), dtype=torch.bool)
         with torch.no_grad(), self._stream.in_use(), self.watch:
+            if not self.attacker.begun:
+                # As in a run: is it random? Then an attack asks several times about each point.
+                self.subject.aside(observation, self.state)
             shown = self.attacker.show(observation, running, self.state)
-            clean, taken = (self.subject.decided(one, self.state) for one in (observation, shown.observation))
+            with put_back():
+                clean = self.subject.decided(observation, self.state)
+            taken = self.subject.decided(shown.observation, self.state)
         return shown, clean, taken
 
+    @usual()
     def advance(self, shown: Tensor, action: Tensor) -> None:
         """Tell a policy with a memory what it was shown and what was done."""
         with torch.no_grad(), self._stream.in_use(), self.watch:

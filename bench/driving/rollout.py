@@ -111,6 +111,8 @@ def rollout(
     several = len(set(salts)) > 1
     victims_draws, attacks_draws = Stream("victim", salts[0]), Stream("attack", salts[0])
     with (
+        # Without it a caller's inference mode leaves no gradient to an attack.
+        torch.inference_mode(False),
         torch.no_grad(),
         victims_draws.in_use(),
         unchanged({type(attack).__name__: attack} if attack else {}, "attack"),
@@ -146,22 +148,25 @@ def rollout(
             probing = probe.due()
             asked = attacker.enforcer.asked = [] if probing else None
             shown = attacker.show(truth, running, state, _view(attack, td))
+            numbers = subject.numbers()
+            unattacked = meter.unattacked(truth, shown, running, state, numbers)
+            clean = None if trace is None else subject.aside(truth, state, numbers)
             if probing or probe.shadow:
                 rehearsal = attacker.enforcer.rehearsed
                 shared = truth, running, state, asked, rehearsal
-                scores, action = probe.driven(shown.observation, *shared, subject.numbers())
+                scores, action = probe.driven(shown.observation, *shared, numbers)
             else:
-                scores, action = subject.driven(shown.observation, state, subject.numbers())
+                scores, action = subject.driven(shown.observation, state, numbers)
             executed = attacker.execute(action)
             if shown.orders is not None:
                 td["orders"] = shown.orders
             if otherwise:
                 deeds.append(executed, shown.orders)
             td = env.step(td.set("action", executed))["next"]
-            meter.step(truth, shown, action, running, state, td)
+            meter.step(truth, shown, unattacked, action, running, state, td)
             meter.forged(shown.used, executed, action, running)
-            if trace is not None:
-                trace.append(_traced(truth, shown, scores, action, executed, running, state, td, subject))
+            if trace is not None and clean is not None:
+                trace.append(_traced(truth, shown, scores, clean, action, executed, running, td))
             state = subject.advance(shown.observation, action, state)
             if bool(td["done"].all()):
                 break
@@ -227,12 +232,11 @@ def _traced(
     truth: Tensor,
     shown: Shown,
     scores: Tensor,
+    clean: Tensor,
     action: Tensor,
     executed: Tensor,
     running: Tensor,
-    state: State,
     after: TensorDictBase,
-    subject: CountedPolicy,
 ) -> dict[str, Tensor]:
     """The values of one step that a recording needs."""
     names = ("progress", "speed", "x", "ttc", "crashed", "offroad")
@@ -244,7 +248,7 @@ def _traced(
         "observation": truth,
         "perturbed": shown.observation,
         "scores": scores,
-        "clean_scores": subject.aside(truth, state),
+        "clean_scores": clean,
         "action": action,
         "executed": executed,
         **forged,

@@ -105,22 +105,17 @@ class ObservationThreat(ThreatModel):
         return ""
 
     def reach(self, rows: int, features: Features, steps: int) -> float:
-        """The largest L2 norm of all that an attack can change in an episode, on the normalised scale.
+        """The largest L2 norm of all that an attack can change in an episode, on the normalised scale; inf if it may change more
+        than what is observed.
 
         Args:
             rows: rows of an observation.
             features: names and ranges of the measured features.
             steps: decisions of a full episode.
         """
-        others = (
-            self.presence != Presence(),
-            self.latency != Latency(),
-            self.held != Held(),
-            self.messages != Messages(),
-        )
-        if any(others):
-            # Another frame, or another car, may be anything.
-            return 2 * math.sqrt(rows * (1 + len(features.names)) * self.frames(steps))
+        if sets.present(self):
+            # Other commands and other traffic make another episode; another frame or another car has other rows, without noise.
+            return math.inf
         extremes = torch.ones(rows, 1 + len(features.names)) * torch.tensor([1.0, -1.0])[:, None, None]
         extremes[..., 0] = 1.0
         largest = self.radius(extremes, features).amax(0)

@@ -5,9 +5,10 @@ An attack that leaves one on would change the victim, or what enforces the threa
 
 from __future__ import annotations
 
+import ctypes
 import gc
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -31,13 +32,14 @@ STACKS = (
     "a mode of torch's operations",
     "a transform of functions",
     "a hook of all saved tensors",
+    "inference mode",
     "a hook of all modules",
     "an operator of its own",
 )
 """What `stacked` counts, as messages call it."""
 
 
-Stacked = tuple[int, int, int, int, tuple[int, ...], frozenset[str]]
+Stacked = tuple[int, int, int, int, bool, tuple[int, ...], frozenset[str]]
 
 
 class Modes:
@@ -103,18 +105,21 @@ class Modes:
     def for_victim(self) -> Iterator[None]:
         """Answer in the middle of an attack's code: with the run's numbers. The attack has its own again after that.
 
+        An attack may ask in inference mode, as in `torch.no_grad`: the answer has its gradient all the same.
+
         Raises:
-            TamperError: if something of the attack is on torch's stacks.
+            TamperError: if something else of the attack is on torch's stacks.
         """
-        self.check(stacked(), "asked under", "attack")
-        self._theirs = numbers()
-        if self._theirs != self._numbers:
-            put(self._numbers)
-        try:
-            yield
-        finally:
+        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else nullcontext():
+            self.check(stacked(), "asked under", "attack")
+            self._theirs = numbers()
             if self._theirs != self._numbers:
-                put(self._theirs)
+                put(self._numbers)
+            try:
+                yield
+            finally:
+                if self._theirs != self._numbers:
+                    put(self._theirs)
 
     @contextmanager
     def for_attack(self) -> Iterator[None]:
@@ -152,6 +157,7 @@ def stacked() -> Stacked:
         torch._C._len_torch_dispatch_stack(),
         torch._C._functorch.maybe_current_level() or 0,
         int(torch._C._autograd._top_saved_tensors_default_hooks(True) is not None),
+        torch.is_inference_mode_enabled(),
         tuple(map(len, HOOKS)),
         # A library may implement some when it is imported.
         _replaced(len(torch.library._impls)),
@@ -160,7 +166,7 @@ def stacked() -> Stacked:
 
 def clear(wanted: Stacked) -> None:
     """Take from torch's stacks what is there beside what `stacked` returned, the latest first."""
-    functions, operations, transforms, saved, hooked, replaced = wanted
+    functions, operations, transforms, saved, infers, hooked, replaced = wanted
     while torch._C._len_torch_function_stack() > functions:
         overrides._pop_mode()
     while torch._C._len_torch_dispatch_stack() > operations:
@@ -169,6 +175,11 @@ def clear(wanted: Stacked) -> None:
         torch._C._functorch.pop_dynamic_layer_stack()
     while not saved and torch._C._autograd._top_saved_tensors_default_hooks(True) is not None:
         torch._C._autograd._pop_saved_tensors_default_hooks()
+    if torch.is_inference_mode_enabled() and not infers:
+        # Only its own context leaves it, which is somebody else's. Another one ends it, as long as that is there: for ever.
+        context = torch.inference_mode(False)
+        context.__enter__()
+        ctypes.pythonapi.Py_IncRef(ctypes.py_object(context))
     for hooks, before in zip(HOOKS, hooked, strict=True):
         while len(hooks) > before:
             hooks.popitem()
@@ -199,6 +210,22 @@ def numbers() -> Numbers:
         torch.get_float32_matmul_precision(),
         bool(torch.backends.mkldnn.enabled),
     )
+
+
+USUAL = Numbers(torch.float32, False, torch.bfloat16, False, "highest", True)
+"""As torch is where nobody has set anything: as workers compute."""
+
+
+@contextmanager
+def usual() -> Iterator[None]:
+    """Compute in the caller's process as in a worker, whatever it has set: its own modes are back after it."""
+    before = numbers()
+    with torch.inference_mode(False):
+        put(USUAL)
+        try:
+            yield
+        finally:
+            put(before)
 
 
 def put(wanted: Numbers) -> None:

@@ -316,7 +316,7 @@ SETTINGS = (
         read=_stacked,
         write=_clear,
         module="torch",
-        usual=(0, 0, 0, 0, (0,) * 4, frozenset()),
+        usual=(0, 0, 0, 0, False, (0,) * 4, frozenset()),
     ),
     Setting(
         name="the gradient mode of torch",

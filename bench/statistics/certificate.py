@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from statistics import NormalDist
 
 from cavbench.statistics.estimates import Interval
@@ -18,12 +19,12 @@ def certificate(clean: Interval, shift: float) -> float:
 
     Args:
         clean: the mean score without an attack, in [0, 1], with its interval. The lower end counts.
-        shift: in standard deviations, at least 0.
+        shift: in standard deviations, at least 0; inf for an attack that changes more than observations.
 
     Returns:
         In [0, 1]. As `clean.low` is exceeded with 97.5 % confidence, so is this.
     """
-    if not clean.low > 0:
+    if not clean.low > 0 or math.isinf(shift):
         return 0.0
     normal = NormalDist()
     return 1.0 if clean.low >= 1 else normal.cdf(normal.inv_cdf(clean.low) - shift)

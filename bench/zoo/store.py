@@ -45,6 +45,7 @@ class Network(Protocol):
 
     def state_dict(self) -> Mapping[str, Tensor]: ...
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> object: ...
+    def named_parameters(self) -> Iterator[tuple[str, Tensor]]: ...
     def requires_grad_(self, requires_grad: bool) -> Any: ...
     def eval(self) -> Any: ...
 
@@ -91,13 +92,14 @@ def save(
         root: folder of a zoo; by default the user's own, which takes precedence over the shipped one.
 
     Raises:
-        UserError: if the recipe does not name the non-default parameters of the world, or a weight is NaN.
+        UserError: if the recipe does not name the non-default parameters of the world, or a weight is NaN or infinite.
     """
     check_world(recipe, world)
     state = {key: value.contiguous() for key, value in network.state_dict().items()}
-    if broken := _with_nan(state):
+    if broken := _broken(state, network):
+        kind = "NaN" if any(state[key].isnan().any() for key in broken) else "infinity"
         raise UserError(
-            f"training {recipe.name}, seed {seed} ended with NaN in {len(broken)} of {len(state)} tensors, {broken[0]!r} the "
+            f"training {recipe.name}, seed {seed} ended with {kind} in {len(broken)} of {len(state)} tensors, {broken[0]!r} the "
             "first: nothing is saved; try a lower learning rate"
         )
     folder = (root or own()) / recipe.key
@@ -107,7 +109,13 @@ def save(
         card = {**card, "start": {"sha256": start.weights_sha256, "tensors": taken}}
         state = {key: value for key, value in state.items() if key not in taken}
     if getattr(network, "half_precision", False):
-        state = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
+        halved = {key: value.half() if value.ndim > 1 else value for key, value in state.items()}
+        if large := [key for key, value in halved.items() if bool((value.isinf() & state[key].isfinite()).any())]:
+            raise UserError(
+                f"training {recipe.name}, seed {seed} ended with more than half precision holds (65504) in {large[0]!r}: "
+                "nothing is saved; try a lower learning rate"
+            )
+        state = halved
     blob = save_tensors(state)
     where = Part.of("world", world)
     full = {
@@ -164,7 +172,7 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
         )
     blob, sha256 = _weights(path, entry)
     try:
-        tensors = _tensors(blob)
+        tensors = load_tensors(blob)
         begun = entry.get("start")
         if not begun:
             _check_sizes(build, entry["shape"], tensors)
@@ -173,6 +181,7 @@ def load(recipe: Recipe, seed: int, build: Callable[..., N], *, against: str = "
             _check_start(recipe, seed, begun, network)
             tensors = _completed(tensors, begun["tensors"], network)
         network.load_state_dict(tensors)
+        _check_finite(tensors, network)
     except (
         SafetensorError,
         ArithmeticError,
@@ -207,24 +216,34 @@ def load_part(recipe: Recipe, seed: int, name: str, part: Module) -> str:
     blob, sha256 = _weights(path, entry)
     start = f"{name}."
     try:
-        stored = _tensors(blob)
-        part.load_state_dict({key.removeprefix(start): own for key, own in stored.items() if key.startswith(start)})
+        stored = {key: own for key, own in load_tensors(blob).items() if key.startswith(start)}
+        part.load_state_dict({key.removeprefix(start): own for key, own in stored.items()})
+        _check_finite(stored, part, start)
     except (SafetensorError, RuntimeError, ValueError) as error:
         raise UserError(f"the weights {path} do not fit {recipe.name!r}: {message(error)}") from None
     return sha256
 
 
-def _tensors(blob: bytes) -> Mapping[str, Tensor]:
-    """The tensors of a weights file; ValueError where one has NaN, for then all answers would be NaN."""
-    tensors: Mapping[str, Tensor] = load_tensors(blob)
-    if broken := _with_nan(tensors):
-        raise ValueError(f"{broken[0]} has NaN")
-    return tensors
+def _check_finite(tensors: Mapping[str, Tensor], network: Network | Module, start: str = "") -> None:
+    """Raise ValueError where a tensor of a file has NaN, or a weight is infinite: answers would be NaN, or parts of it dead.
+
+    Args:
+        tensors: those of the file.
+        network: the network, or the part of it, that was filled with them.
+        start: what stands in the file before the names of the part.
+    """
+    if broken := _broken(tensors, network, start):
+        raise ValueError(f"{broken[0]} has {'NaN' if tensors[broken[0]].isnan().any() else 'an infinite weight'}")
 
 
-def _with_nan(tensors: Mapping[str, Tensor]) -> list[str]:
-    """The names of the tensors that have NaN."""
-    return [name for name, one in tensors.items() if one.is_floating_point() and one.isnan().any()]
+def _broken(tensors: Mapping[str, Tensor], network: Network | Module, start: str = "") -> list[str]:
+    """The names of the tensors that have NaN, and of the weights that are infinite. Constants may be, as a mask is."""
+    weights = {start + name for name, _ in network.named_parameters()}
+    return [
+        name
+        for name, one in tensors.items()
+        if one.is_floating_point() and bool((~one.isfinite() if name in weights else one.isnan()).any())
+    ]
 
 
 def own_files(recipe: Recipe, seed: int) -> tuple[Path, ...]:

@@ -76,6 +76,8 @@ class ApproachEnv(DrivingEnv):
         width = self.scenes[0].boxes[:, 2] - self.scenes[0].boxes[:, 0]
         # The median: a box at the edge of the image is cut off.
         self.sign_px_m = float((width * self.distances).median())
+        self._pictures: list[tuple[int, Tensor] | None] = [None] * batch
+        """The number of the frame that each car saw last, and its image: while a car is near one frame, it is rendered once."""
         self.motion = Motion(*(torch.zeros(batch) for _ in range(3)))
         self.hit = torch.zeros(batch, len(seeds), dtype=torch.bool)
         number = Unbounded(shape=(batch, 1), dtype=torch.float32)
@@ -137,8 +139,7 @@ class ApproachEnv(DrivingEnv):
         frames = (self.motion.distance[:, None] - self.distances).abs().argmin(-1)
         pictures, boxes, visible = [], [], []
         for number, (scenes, frame) in enumerate(zip(self.scenes, frames, strict=True)):
-            patch = None if self.patches is None else self.patches[number : number + 1]
-            pictures.append(scenes.render(frame.view(1), patch, self.share)[0])
+            pictures.append(self._picture(number, int(frame)))
             boxes.append(scenes.boxes[frame])
             visible.append(scenes.visible[frame].view(1))
         ended = self._ended()[:, None]
@@ -154,9 +155,18 @@ class ApproachEnv(DrivingEnv):
             "braked": self.traffic.braked,
         }
         content = {
-            "observation": torch.stack(pictures).detach(),
+            "observation": torch.stack(pictures),
             "info": TensorDict(info, batch_size=self.batch_size),
             "done": ended,
             "terminated": ended.clone(),
         }
         return TensorDict(content, batch_size=self.batch_size)
+
+    def _picture(self, number: int, frame: int) -> Tensor:
+        """The image [3, H, W] of a frame, as a car sees it."""
+        last = self._pictures[number]
+        if last is None or last[0] != frame:
+            patch = None if self.patches is None else self.patches[number : number + 1]
+            shown = self.scenes[number].render(torch.tensor([frame]), patch, self.share)[0]
+            self._pictures[number] = last = (frame, shown.detach())
+        return last[1]

@@ -11,8 +11,12 @@ import torch
 
 import cavbench
 from cavbench.driving import ObservationThreat
+from cavbench.driving.access import DRAWS
+from cavbench.isolation.modes import numbers, stacked
+from tests.isolation.torch_modes import CALLERS
 
 CELL: dict[str, Any] = {"lanes": 3, "density": 1, "weather": "clear"}
+PGD = cavbench.component("attack", "pgd", steps=2, restarts=1)
 MARGIN = {"objective": "margin", "steps": 4, "restarts": 1}
 
 
@@ -94,3 +98,21 @@ def test_what_is_wrong_is_one_line(changes: dict[str, Any], line: str) -> None:
 
 def test_an_attack_that_knows_the_dynamics_needs_no_more_words(observed: Any) -> None:
     assert cavbench.attack("plan", "dqn", observed, **CELL).queries.min() > 0
+
+
+@pytest.mark.parametrize("mode", CALLERS)
+def test_what_the_caller_has_switched_on_changes_no_answer(mode: str, observed: Any) -> None:
+    """In inference mode an attack had no gradient."""
+    wanted = cavbench.attack(PGD, "dqn", observed, seed=4)
+    with CALLERS[mode]():
+        before = stacked(), numbers(), torch.is_grad_enabled()
+        found = cavbench.attack(PGD, "dqn", observed, seed=4)
+        assert (stacked(), numbers(), torch.is_grad_enabled()) == before
+    assert (wanted.observation != observed).any()
+    assert (found.observation == wanted.observation).all()
+    assert (found.clean == wanted.clean).all()
+
+
+def test_a_random_victim_is_asked_several_times_about_each_point_as_in_a_run(observed: Any) -> None:
+    once, often = (cavbench.attack(PGD, "dqn", observed, defense=defense) for defense in ("none", "smoothing"))
+    assert (often.queries == DRAWS * once.queries).all()

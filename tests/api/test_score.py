@@ -21,11 +21,14 @@ from cavbench.core.track import track
 from cavbench.driving import ActionType, DrivingAttack, Oracle, Policy
 from cavbench.envs.highway.world import HighwayWorld
 from cavbench.errors import UserError
+from cavbench.isolation.modes import USUAL, numbers
 from cavbench.records import reading
 from cavbench.run import runner
 from cavbench.run.config import plan_of
 from tests.driving.victims.policy_files import sb3_model, spaces
+from tests.isolation.torch_modes import CALLERS
 
+PGD = cavbench.component("attack", "pgd", steps=1, restarts=1)
 SHORT = HighwayWorld(max_steps=15)
 WHERE: dict[str, Any] = {"lanes": 3, "density": 1, "weather": "clear", "episodes": 2, "world": SHORT}
 
@@ -251,3 +254,21 @@ def test_a_network_that_stands_twice_in_a_list_is_refused(tmp_path: Path) -> Non
     network = nn.Linear(50, 5)
     with pytest.raises(UserError, match="the victims 1 and 3 of the list are the same network"):
         cavbench.score([network, nn.Linear(50, 5), network], "noise", out=tmp_path)
+
+
+class Looks(Policy):
+    """Brakes where torch is as in a worker, and otherwise not."""
+
+    action_type: ClassVar[ActionType] = "discrete"
+
+    def scores(self, observation: Tensor, state: Any = None) -> Tensor:
+        usual = numbers() == USUAL and not torch.is_inference_mode_enabled()
+        return 0.01 * observation[..., 0, :] + float(usual) * torch.eye(5)[4].to(observation)
+
+
+@pytest.mark.parametrize("mode", ["inference_mode", "autocast", "default", "precision"])
+def test_it_computes_as_a_worker_does_whatever_the_caller_has_switched_on(mode: str, score: Callable[..., Any]) -> None:
+    with CALLERS[mode]():
+        records = score(Looks().eval(), PGD, episodes=1).records
+    assert all(counts[4] == steps for counts, steps in zip(records["action_counts"], records["steps"], strict=True))
+    assert records["zero_gradients"].dropna().tolist() == [0.0]

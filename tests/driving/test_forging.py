@@ -166,6 +166,35 @@ def test_time_never_runs_backwards() -> None:
         drive(attacker)
 
 
+@pytest.mark.parametrize("allowed", [{"latency": {"frames": 3}}, {"held": {"longest": 9, "share": 1.0}}])
+def test_an_answer_of_values_alone_shows_the_newest_frame(allowed: dict[str, Any]) -> None:
+    """After it no older frame may be shown, as after an answer that says so."""
+    order = iter((0, 1, 2, None, 1, None, 2))
+    shown: list[Tensor] = []
+
+    def answer(observation: Tensor, oracle: Oracle) -> Any:
+        age = next(order)
+        return observation if age is None else Forgery(age=ages(age))
+
+    with pytest.raises(UserError, match="an earlier frame after a later one"):
+        drive(at_work(answer, **allowed), shown)
+    assert len(shown) == 6
+    assert all(torch.equal(one, truth(step)) for step, one in zip((0, 0, 0, 3, 3, 5), shown, strict=True))
+
+
+def test_an_invented_car_has_gone_after_an_answer_of_values_alone() -> None:
+    """It may appear elsewhere then: it need not go on from where it was."""
+    order = iter((0.2, None, 0.6))
+
+    def answer(observation: Tensor, oracle: Oracle) -> Any:
+        x = next(order)
+        return observation if x is None else Forgery(invented=ghosts(1, observation, x))
+
+    attacker = at_work(answer, presence={"invented": 1})
+    excess = [show(attacker, step).excess for step in range(3)]
+    assert all(float(one.max()) < 0.01 for one in excess)
+
+
 @pytest.mark.parametrize(("longest", "share", "why"), [(2, 1.0, "repetitions in a row"), (15, 0.1, "held the sensor")])
 def test_a_frozen_sensor_thaws(longest: int, share: float, why: str) -> None:
     count = iter(range(STEPS))
@@ -202,6 +231,23 @@ def test_commands_are_executed_late() -> None:
         show(attacker, step)
         executed.append(int(attacker.execute(torch.full((BATCH,), step))[0]))
     assert executed == [0, 0, 0, 1, 2]
+
+
+def test_the_coin_of_a_frame_is_the_same_whether_or_not_the_attack_answered_before() -> None:
+    def replaced(answers: Callable[[int], bool]) -> list[bool]:
+        steps = iter(range(60))
+        attacker = at_work(
+            lambda o, _: Forgery(action=ages(4)) if answers(next(steps)) else Forgery(), actuator={"replaced": 0.3}
+        )
+        found = []
+        for step in range(60):
+            show(attacker, step % 7)
+            found.append(bool((attacker.execute(torch.zeros(BATCH, dtype=torch.int64)) == 4)[0]))
+        return found
+
+    always, late = replaced(lambda step: True), replaced(lambda step: step >= 20)
+    assert 5 < sum(always) < 30
+    assert late == [False] * 20 + always[20:]
 
 
 def test_the_run_tosses_the_coin_of_the_probabilistic_action_robust_process() -> None:

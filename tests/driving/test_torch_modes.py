@@ -65,7 +65,7 @@ def test_nothing_is_left_for_the_next_unit(name: str, who: str) -> None:
         assert stacked() == before
 
 
-@pytest.mark.parametrize("name", STACKED)
+@pytest.mark.parametrize("name", STACKED.keys() - {"inference mode"})
 def test_a_victim_is_not_asked_under_a_mode_of_the_attack(name: str) -> None:
 
     def ask(observation: Tensor, oracle: Oracle) -> None:
@@ -165,10 +165,14 @@ def test_what_a_victim_sets_changes_nobody_else(change: Callable[[], object]) ->
 def test_attacks_compute_in_modes_of_their_own(mode: Mode) -> None:
     answers: list[Tensor] = []
 
+    def asked(observation: Tensor, oracle: Oracle) -> list[Tensor]:
+        return [oracle.scores(observation), *oracle.gradient(observation, lambda scores: scores[..., 0])]
+
     def deed(observation: Tensor, oracle: Oracle) -> None:
-        outside = oracle.scores(observation)
+        outside = asked(observation, oracle)
+        assert bool(outside[-1].any())
         with mode():
-            answers.append(oracle.scores(observation) - outside)
+            answers.extend(one - other for one, other in zip(asked(observation, oracle), outside, strict=True))
 
     drive(deed)
     assert all(bool((one == 0).all()) for one in answers)

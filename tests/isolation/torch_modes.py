@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from itertools import cycle
 from typing import Any, Self
 
@@ -54,6 +54,7 @@ STACKED: dict[str, Mode] = {
     "a mode of torch's functions": Functions,
     "a mode of torch's operations": Operations,
     "a hook of all saved tensors": lambda: saved_tensors_hooks(lambda x: x, lambda x: x),
+    "inference mode": torch.inference_mode,
     "a hook of all modules": ModuleHook,
     "an operator of its own": Operator,
 }
@@ -89,6 +90,10 @@ class Left:
     def __exit__(self, *about: object) -> None:
         self.leave()
         assert stacked() == self.before
+        # With it, an inference mode puts back whether gradients are computed.
+        differentiates = torch.is_grad_enabled()
+        del self.mode
+        torch.set_grad_enabled(differentiates)
 
     def enter(self) -> None:
         if not self.entered:
@@ -99,3 +104,22 @@ class Left:
         if self.entered and stacked() != self.before:
             self.mode.__exit__(None, None, None)
         self.entered = False
+
+
+CALLERS: dict[str, Mode] = {
+    "inference_mode": torch.inference_mode,
+    "no_grad": torch.no_grad,
+    "autocast": lambda: torch.autocast("cpu"),
+    "default": lambda: changed(torch.set_default_dtype, torch.float64, torch.float32),
+    "precision": lambda: changed(torch.set_float32_matmul_precision, "medium", "highest"),
+}
+"""What a caller's program may have switched on around a call."""
+
+
+@contextmanager
+def changed(write: Callable[[Any], object], value: Any, before: Any) -> Iterator[None]:
+    write(value)
+    try:
+        yield
+    finally:
+        write(before)

@@ -82,16 +82,42 @@ def test_a_training_that_ended_with_nan_is_not_saved(home: Path, highway: Drivin
     assert zoo.seeds(RECIPE) == [3]
 
 
-def test_weights_with_nan_are_refused_whole_and_in_part(saved: Path) -> None:
+def test_a_training_that_ended_with_infinity_is_not_saved(home: Path, highway: DrivingWorld) -> None:
+    """A unit that is always off, or on, and finite answers: nothing else would tell."""
+    network = QPolicy(5, 5, 8)
+    with torch.no_grad():
+        next(network.parameters())[0, 0] = -float("inf")
+    with pytest.raises(UserError, match=r"ended with infinity in 1 of \d+ tensors, '.*' the first: nothing is saved"):
+        zoo.save(network, RECIPE, seed=4, world=highway, card={})
+    assert zoo.seeds(RECIPE) == []
+
+
+@pytest.mark.parametrize("constant", [False, True])
+def test_what_half_precision_would_make_infinite_is_not_saved(
+    home: Path, highway: DrivingWorld, constant: bool
+) -> None:
+    network: Any = QPolicy(5, 5, 8)
+    network.half_precision = True
+    network.register_buffer("scale", torch.tensor([[65504.0, -float("inf")]]))
+    zoo.save(network, RECIPE, seed=3, world=highway, card={})
+    with torch.no_grad():
+        (network.scale if constant else next(network.parameters()))[0, 0] = 70000.0
+    with pytest.raises(UserError, match=r"ended with more than half precision holds \(65504\) in '.*'"):
+        zoo.save(network, RECIPE, seed=4, world=highway, card={})
+    assert zoo.seeds(RECIPE) == [3]
+
+
+@pytest.mark.parametrize(("value", "what"), [("nan", "NaN"), ("-inf", "an infinite weight")])
+def test_weights_with_nan_or_infinity_are_refused_whole_and_in_part(saved: Path, value: str, what: str) -> None:
     """Their card has the right hash."""
     tensors = load_file(saved)
     zoo.load_part(RECIPE, 3, "network", part := QPolicy(5, 5, 8).network)
     assert torch.equal(part.head[0].weight, tensors["network.head.0.weight"])
-    tensors["network.head.0.weight"][0, 0] = float("nan")
+    tensors["network.head.0.weight"][0, 0] = float(value)
     saved.write_bytes(save_tensors(tensors))
     changed(saved, lambda entry: entry.update(sha256=hashlib.sha256(saved.read_bytes()).hexdigest()))
     for load in (lambda: zoo.load(RECIPE, 3, QPolicy), lambda: zoo.load_part(RECIPE, 3, "network", part)):
-        with pytest.raises(UserError, match=r"do not fit 'dqn': network\.head\.0\.weight has NaN"):
+        with pytest.raises(UserError, match=rf"do not fit 'dqn': network\.head\.0\.weight has {what}"):
             load()
 
 

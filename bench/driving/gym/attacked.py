@@ -19,6 +19,7 @@ from cavbench.driving.gym.given import world as world_of
 from cavbench.driving.one_step import Form, Session
 from cavbench.driving.victims.in_process import in_process
 from cavbench.errors import UserError
+from cavbench.isolation.modes import usual
 from cavbench.scenarios import Cell
 
 
@@ -86,6 +87,7 @@ class AttackedEnv(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(action)
         return *self._shown(observation, info)[:1], reward, terminated, truncated, self._info
 
+    @usual()
     def _begun(self, observation: Any) -> Session:
         form = Form(self._facts, self._flat(observation))
         if isinstance(self.policy, str | DrivingVictim):

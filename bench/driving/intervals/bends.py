@@ -35,8 +35,12 @@ ONWARD = 50.0
 """Bends as far ahead of a car, in m, count for what it will drive."""
 REMEMBERED = 6
 """Number of cars out of sight that the tracker remembers."""
-IN_SIGHT = -8.0
-"""A car that is less behind than this along the ego's lane is surely seen, in m (BEHIND of highway-env's observation is -10)."""
+IN_SIGHT, ROUND = -8.0, math.pi - 0.1
+"""A car that is less behind than this along the ego's lane is surely seen, in m (BEHIND of highway-env's observation is -10), if
+it is not farther round a circular lane than this, in rad from where the lane begins."""
+CREEPING, BLIND = 1.0, 2.0
+"""From a bend the ego sees nothing beyond its end until it is there. Up to a car's length and `BLIND` m behind the end, a car out
+of sight is assumed to drive at least at `CREEPING` m/s, if it may be as fast. Else the ego would wait for it for ever."""
 
 
 class Table(NamedTuple):
@@ -422,6 +426,10 @@ def _remembered(boxes: Boxes, tracks: Tensor, found: Tensor, way: Way) -> Boxes:
     kept = (tracks[..., 0] > 0) & ~found & hidden & (tracks[..., 1] > 0)
     order = torch.where(kept, tracks[..., 1], torch.inf).sort(stable=True, dim=-1).indices[..., :REMEMBERED]
     rows = tracks.gather(-2, order.unsqueeze(-1).expand(*order.shape, tracks.shape[-1])).clone()
+    # Who is not seen, is not where the ego sees everyone: in its bend, unless the rows are full.
+    bent, end = _bend(way, station.detach())
+    seen = torch.where(bent & ~boxes.present[..., -1], end - ROUNDING, -FAR).unsqueeze(-1)
+    rows[..., 1], rows[..., 5] = rows[..., 1].maximum(seen), rows[..., 5].maximum(seen)
     rows[..., 4] = rows[..., 8] = -boxes.low[..., :1, 3]
     return Boxes(
         torch.cat([boxes.present, kept.gather(-1, order)], -1),
@@ -457,7 +465,7 @@ def _hidden(way: Way, station: Tensor, offset: Tensor, stations: Tensor, beside:
     bent = (curvature != 0)[..., None, None]
     along = torch.where(bent, angle * radius, onwards) - at[..., None, None]
     longer = (1 - curvature * offset)[..., None, None]
-    return ((along * longer < IN_SIGHT) | (bent & (angle > math.pi - 0.1))).any(-1)
+    return ((along * longer < IN_SIGHT) | (bent & (angle > ROUND))).any(-1)
 
 
 def cut(car: Kinematics) -> float:
@@ -570,17 +578,40 @@ def predicted(boxes: Boxes, before: Ego, after: Tensor, car: Kinematics, limits:
     ahead = found[..., 5] + driven.unsqueeze(-1) - high[..., 0] - slack
     found[..., 1] = low[..., 0] + behind * torch.where(behind >= 0, least, most) - moved.unsqueeze(-1) - slack
     found[..., 5] = high[..., 0] + ahead * torch.where(ahead >= 0, most, least) - moved.unsqueeze(-1) + slack
-    # Cars out of sight, which have no speed across the way, keep their lane, and may brake or gain speed as any car.
+    # Cars out of sight, which have no speed across the way, keep their lane, and may brake or gain speed as any car. Where one
+    # would keep the ego from seeing past its bend, it does not stop.
     now = after[:, motion_kernels.SPEED, None], after[:, motion_kernels.HEADING, None]
     unseen = low[..., 3] == high[..., 3]
     speeds = [(absolute[0][..., 1] - float(limits.gained)).clamp(min=0)]
     speeds.append((absolute[1][..., 1] + float(limits.gained)).clamp(max=car.top_speed))
     for place, side, share in ((2, 0, least), (6, 1, most)):
-        further = (low, high)[side][..., 0] + speeds[side] * share * period - moved.unsqueeze(-1)
-        found[..., place - 1] = torch.where(unseen, further, found[..., place - 1])
+        further = (low, high)[side][..., 0] + speeds[side] * share * period
+        if side == 0:
+            crept = (low[..., 0] + CREEPING * least * period).minimum(_in_the_way(car, station).unsqueeze(-1))
+            further = torch.where(absolute[1][..., 1] >= CREEPING, further.maximum(crept), further)
+        found[..., place - 1] = torch.where(unseen, further - moved.unsqueeze(-1), found[..., place - 1])
         found[..., place + 1] = torch.where(unseen, speeds[side] - now[0] * now[1].cos(), found[..., place + 1])
         found[..., place] = torch.where(
             unseen, absolute[side][..., 0] - after[:, motion_kernels.Y, None], found[..., place]
         )
         found[..., place + 2] = torch.where(unseen, -now[0] * now[1].sin(), found[..., place + 2])
     return found
+
+
+def _bend(way: Way, station: Tensor) -> tuple[Tensor, Tensor]:
+    """Whether stations [...] are in a bend, bool, and how far from them its part ends that is seen from within it, in m.
+
+    Farther round than `ROUND` nobody is surely seen, which is at the end of a half circle.
+    """
+    table, number = _at(way, station)
+    curvature, length = table.curvature[number].abs(), table.length[number]
+    seen = torch.minimum(length, ROUND / torch.where(curvature == 0, 1.0, curvature))
+    return curvature != 0, table.station[number] + seen - station
+
+
+def _in_the_way(car: Kinematics, station: Tensor) -> Tensor:
+    """How far ahead of stations [...] in a bend a car lets the ego come to where it sees past the bend, in m; else -`FAR`."""
+    assert car.way is not None
+    table, number = _at(car.way, station)
+    end = table.station[number] + table.length[number] - station
+    return torch.where(table.curvature[number] != 0, end + car.length + lengthened(car) + BLIND, -FAR)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 import pytest
@@ -57,6 +58,25 @@ def test_no_episode_can_be_changed_by_more_than_the_reach(norm: Norm, budget: fl
     seen[..., 0] = 1.0
     largest = float(threat.radius(seen, world.features).flatten(1).norm(dim=1).max()) * math.sqrt(threat.frames(450))
     assert largest <= threat.reach(10, world.features, 450) + 1e-4
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"actuator": {"delay": 4}},
+        {"actuator": {"replaced": 0.5}},
+        {"traffic": {"cars": 1}},
+        {"dynamics": {"time_gap": 0.6}},
+        {"presence": {"hidden": 1}, "share": 0.01},
+    ],
+)
+def test_what_changes_more_than_observations_leaves_no_certificate(more: dict[str, Any]) -> None:
+    """The noise on what is seen hides nothing of other commands and other traffic, nor whether a row is there."""
+    reach, alone = (
+        ObservationThreat(budget=1e-6, **sets).reach(10, HighwayWorld().features, 450) for sets in (more, {})
+    )
+    assert certificate(Interval(0.9, 0.8, 1.0), reach / 10) == 0.0
+    assert certificate(Interval(0.9, 0.8, 1.0), alone / 10) > 0.5
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3, 1.5])

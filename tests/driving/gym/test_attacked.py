@@ -12,6 +12,7 @@ from tensordict import TensorDict
 
 import cavbench
 from cavbench.driving import Policy
+from tests.isolation.torch_modes import CALLERS
 
 CELL: dict[str, Any] = {"lanes": 3, "density": 1, "weather": "clear"}
 
@@ -103,3 +104,37 @@ def test_what_is_wrong_is_one_line(options: dict[str, Any], line: str) -> None:
     given: dict[str, Any] = {"attack": "noise", "policy": torch.nn.Linear(4, 2)} | options
     with pytest.raises(cavbench.UserError, match=line):
         cavbench.gym.AttackedEnv(gymnasium.make("CartPole-v1"), **given).reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("mode", "name", "allowed"),
+    [
+        ("lost", "actuator", {"replaced": 0.5}),
+        ("rude", "dynamics", {"time_gap": 0.6, "braking": 7.0, "lane_gain": 0.0, "imposed_braking": 5.0}),
+    ],
+)
+def test_a_set_that_changes_what_cars_do_is_refused(mode: Any, name: str, allowed: dict[str, float]) -> None:
+    """Nothing would be attacked: the environment drives on as it is."""
+    fault, line = cavbench.component("attack", "fault", mode=mode), f"threat.{name} changes what cars do"
+    env = cavbench.gym.make("highway", **CELL)
+    seen, _ = env.reset(seed=0)
+    with pytest.raises(cavbench.UserError, match=line):
+        cavbench.gym.AttackedEnv(env, fault, "dqn", threat={name: allowed}).reset(seed=0)
+    with pytest.raises(cavbench.UserError, match=line):
+        cavbench.attack(fault, "dqn", seen, threat={name: allowed}, **CELL)
+
+
+@pytest.mark.parametrize("mode", CALLERS)
+def test_a_training_in_a_mode_of_torch_is_attacked_as_without(mode: str) -> None:
+    """Libraries collect episodes in inference mode, in which an attack had no gradient."""
+
+    def shown() -> list[Any]:
+        env = cavbench.gym.AttackedEnv(cavbench.gym.make("highway", max_steps=4, **CELL), pgd(), "dqn")
+        return [env.reset(seed=4), *(env.step(1) for _ in range(3))]
+
+    wanted = shown()
+    with CALLERS[mode]():
+        found = shown()
+    for (seen, *_, info), (other, *_, about) in zip(wanted, found, strict=True):
+        assert info["attack"]["gradients"] == about["attack"]["gradients"] > 0
+        assert (seen == other).all()

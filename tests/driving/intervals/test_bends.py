@@ -17,8 +17,9 @@ from cavbench.core.pair import choose
 from cavbench.defenses.driving.shield import Shield, Shielded
 from cavbench.defenses.driving.tracker import Tracked, Tracker
 from cavbench.driving import Control, ObservationThreat
-from cavbench.driving.intervals.bends import REMEMBERED, directions, enclosed, points, projected, slip
+from cavbench.driving.intervals.bends import CREEPING, REMEMBERED, directions, enclosed, points, projected, slip
 from cavbench.driving.intervals.boxes import Boxes
+from cavbench.driving.intervals.ego import Step
 from cavbench.driving.intervals.policy import reckoning
 from cavbench.driving.intervals.rooms import cars_of
 from cavbench.driving.intervals.tracks import predicted
@@ -34,6 +35,7 @@ assert CAR is not None
 assert CAR.way is not None
 WAY, WIDTH = CAR.way, CAR.lane_width
 HALF_CIRCLE, END = 128.0, 128.0 + 20 * math.pi
+SLOW = FACTS.actions.index("SLOWER")
 STILL = -1e-3
 """Cars drive forwards. One that crashed may roll back, which the tracker does not allow for on any road."""
 
@@ -185,17 +187,71 @@ def test_a_car_that_gets_out_of_sight_is_remembered() -> None:
     boxes = moves.boxes(policy.assumed, alone(step.after), step.after, tracks)
     assert boxes.present.shape == (1, 10 + REMEMBERED)
     assert boxes.present[0, 10:].sum() == 1
-    # It may have stopped behind the end of the half circle.
+    # It may have braked to walking pace, as long as it would be in the way where the ego sees past the end.
     for _ in range(20):
-        step = moves.step(boxes, step.after, torch.tensor([4]))
-        tracks = predicted(boxes, *step, CAR, policy.period)
-        boxes = moves.boxes(policy.assumed, alone(step.after), step.after, tracks)
+        step, boxes = one_later(policy, boxes, step.after, torch.tensor([SLOW]))
     assert boxes.present[0, 10:].sum() == 1
     stands, own = float(boxes.low[0, 10, 0] + boxes.low[0, 0, 0]), boxes.low[0, 0, 2]
-    assert 190 < stands < 193
+    assert END < stands < 194
     assert float(boxes.low[0, 10, 2] + own) == pytest.approx(0, abs=1e-4)
     assert float(boxes.high[0, 10, 0] + boxes.low[0, 0, 0]) > 199
     assert float(cars_of(moves.now(boxes, step.after), boxes, CAR).low[0, 9, 0]) < stands - float(step.after[0, 7])
+    # Farther on it may have stopped.
+    for _ in range(120):
+        step, boxes = one_later(policy, boxes, step.after, torch.tensor([SLOW]))
+    stands, own = float(boxes.low[0, 10, 0] + boxes.low[0, 0, 0]), boxes.low[0, 0, 2]
+    assert END + CAR.length < stands < END + CAR.length + 4
+    assert float(boxes.low[0, 10, 2] + own) == pytest.approx(0, abs=1e-4)
+
+
+def one_later(policy: Tracked, boxes: Boxes, state: Tensor, action: Tensor) -> tuple[Step, Boxes]:
+    """The ego and the boxes after an action [1], where nobody is seen."""
+    step = policy.reckoning.step(boxes, state, action)
+    tracks = predicted(boxes, *step, CAR, policy.period)
+    return step, policy.reckoning.boxes(policy.assumed, alone(step.after), step.after, tracks)
+
+
+def out_of_sight(speed: float) -> tuple[Tracked, Boxes, Tensor]:
+    """Boxes of an ego in the half circle that has just lost sight of a car ahead at this speed in m/s, and the ego's state."""
+    policy = Tracked(Tracker(), Shielded(Shield(), Fastest(), FACTS), FACTS)
+    low, high = torch.zeros(1, 10, 4), torch.zeros(1, 10, 4)
+    low[0, 0] = high[0, 0] = torch.tensor([170.0, 0.0, 8.0, 0.0])
+    present = torch.zeros(1, 10, dtype=torch.bool)
+    present[0, :2] = True
+    low[0, 1] = torch.tensor([20.5, -0.2, speed - 8.2, -0.2])
+    high[0, 1] = torch.tensor([21.5, 0.2, speed - 7.8, 0.2])
+    return policy, Boxes(present, low, high), torch.tensor([[0.0, 0.0, 8.0, 0.0, 8.0, 1.0, 1.0, 170.0]])
+
+
+def fastest(policy: Tracked, boxes: Boxes, state: Tensor) -> Tensor:
+    """FASTER where the shield allows it, else SLOWER, [1]."""
+    shield = policy.policy
+    assert isinstance(shield, Shielded)
+    allowed = shield.allowed(shield.margins(policy.reckoning.now(boxes, state), boxes))
+    return torch.where(allowed[:, FAST] > 0.5, FAST, SLOW)
+
+
+@settings(max_examples=6, deadline=None)
+@given(speed=some.floats(1.5, 8), braking=some.floats(0.5, 6), delay=some.integers(0, 30))
+@pytest.mark.slow
+def test_a_car_out_of_sight_is_not_hit_and_not_waited_for_for_ever(speed: float, braking: float, delay: int) -> None:
+    """It brakes at some moment, in the way to walking pace, farther on to a stop; then the ego comes to where it sees it."""
+    policy, boxes, state = out_of_sight(speed)
+    true, station, dt = speed, 191.0, policy.period
+    for moment in range(300):
+        step, boxes = one_later(policy, boxes, state, fastest(policy, boxes, state))
+        state = step.after
+        least = CREEPING if station < END + CAR.length + 3 else 0.0
+        slower = max(true - braking * dt, min(least, true)) if moment >= delay else true
+        station, true = station + (true + slower) / 2 * dt, slower
+        assert station - float(state[0, 7]) > CAR.length, moment
+        if float(state[0, 7]) > END:
+            break
+        rows = boxes.present[0, 10:]
+        low, high = (side[0, 10:][rows] + boxes.low[0, 0] for side in (boxes.low, boxes.high))
+        here = (low[:, 0] <= station) & (station <= high[:, 0]) & (low[:, 2] <= true) & (true <= high[:, 2])
+        assert bool(here.any()), (moment, station, true)
+    assert float(state[0, 7]) > END
 
 
 def test_a_driver_without_intervals_is_shown_the_middles_in_the_frame_of_the_world() -> None:

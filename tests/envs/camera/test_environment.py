@@ -60,3 +60,22 @@ def test_the_patch_is_on_the_sign() -> None:
     assert difference[:, y0:y1, x0:x1].mean() > 0.02
     difference[:, y0:y1, x0:x1] = 0
     assert not difference.any()
+
+
+def test_a_frame_is_rendered_when_the_car_comes_near_it_and_shown_until_it_has_left_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    own = scenes()
+    env, render, rendered = ApproachEnv([own, own], brakes=Brakes(greatest=8.0, jerk=math.inf)), own.render, []
+
+    def counted(frames: torch.Tensor, patches: torch.Tensor | None, share: float) -> torch.Tensor:
+        rendered.append(int(frames))
+        return render(frames, patches, share)
+
+    monkeypatch.setattr(own, "render", counted)
+    steps = _driven(env, 3.0)
+    frames = [int(step["info", "frame"][0]) for step in steps]
+    assert len(set(frames)) < len(frames)
+    assert rendered == [frame for frame in dict.fromkeys((0, *frames)) for _ in range(2)]
+    for step, frame in zip(steps, frames, strict=True):
+        torch.testing.assert_close(step["observation"][1], render(torch.tensor([frame]), None, 0.5)[0], rtol=0, atol=0)
