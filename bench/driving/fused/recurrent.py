@@ -5,6 +5,7 @@ Encoder and head are passes of `kernels`; here is the unit between them (Cho et 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -124,7 +125,7 @@ def forward(
     Args:
         points: observations, and the memory before them [N, V * F + M].
         weights: the encoder's, those of the unit (`_remember`), then the head's.
-        widths: E, size of what is encoded; then number of inputs of each layer of the head, the first with E + M, and its outputs.
+        widths: E, size of what is encoded; then as in `kernels.forward`, of the head: the first one is E + M.
         out: the answers and the memory [N, A + M].
         gates: as of `_remember`, [blocks, 4 * M, LANES].
     """
@@ -197,7 +198,7 @@ class Recurrent(Fused):
         network: nn.Module,
         encoder: tuple[nn.Linear, nn.Linear, nn.Linear],
         cell: nn.GRUCell,
-        layers: list[tuple[nn.Linear, type[nn.Module] | None]],
+        layers: Sequence[tuple[nn.Linear, type[nn.Module] | None]],
     ) -> None:
         super().__init__(network, layers, encoder=encoder)
         self.memory = cell.hidden_size
