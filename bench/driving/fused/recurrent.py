@@ -5,7 +5,7 @@ Encoder and head are passes of `kernels`; here is the unit between them (Cho et 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import numpy as np
@@ -191,7 +191,7 @@ class Recurrent(Fused):
     """
 
     marked: ClassVar[tuple[str, ...]] = (*Fused.marked, "memory")
-    passes = forward, backward
+    passes: ClassVar[tuple[Callable[..., None], Callable[..., None]]] = forward, backward
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 from unittest.mock import patch
 
@@ -70,7 +71,7 @@ def test_answers_and_gradients_are_those_of_torch(network: RecurrentNetwork, poi
     for only in (slice(None), slice(actions), slice(actions, None)):
         found = slope(network, x, before, only)
         assert bool(found.any())
-        wanted = by_torch(lambda only=only: slope(network, x, before, only))  # type: ignore[misc]
+        wanted = by_torch(partial(slope, network, x, before, only))
         torch.testing.assert_close(found, wanted, atol=3e-5, rtol=1e-5)
 
 
@@ -161,6 +162,10 @@ def another_cell(network: Any) -> None:
     network.cell = nn.GRUCell(network.cell.input_size, network.cell.hidden_size).requires_grad_(False)
 
 
+def halved_memory(network: Any) -> None:
+    network.cell.register_forward_hook(lambda *given: given[-1] / 2)
+
+
 class Forgetful(nn.GRUCell):
     def forward(self, given: Tensor, before: Tensor | None = None) -> Tensor:
         return super().forward(given)
@@ -175,7 +180,7 @@ MORE: dict[str, Callable[[nn.Module], object]] = {
     "cell": another_cell,
     "cell without bias": without_bias,
     "class of the cell": another_class_of_cell,
-    "hook of the cell": lambda network: network.cell.register_forward_hook(lambda *given: given[-1] / 2),
+    "hook of the cell": halved_memory,
 }
 
 
