@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torchrl.modules import MLP
 
 from cavbench.driving import Policy, State
-from cavbench.driving.victims.networks import Encoder, QPolicy, whatever_the_batch
+from cavbench.driving.fused.recurrent import Recurrent
+from cavbench.driving.victims.networks import Encoder, QPolicy, layers_of, whatever_the_batch
 
 
 class RecurrentNetwork(nn.Module):
@@ -25,6 +26,7 @@ class RecurrentNetwork(nn.Module):
         self.head = MLP(
             in_features=size + memory, out_features=actions, num_cells=[hidden, hidden], activation_class=nn.ReLU
         )
+        self.fused = Recurrent(self, self.encoder.layers, self.cell, layers_of(self.head))
 
     def forward(self, observation: Tensor, memory: Tensor) -> Tensor:
         """Both in one tensor [..., A + M]."""

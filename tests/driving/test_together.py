@@ -21,12 +21,14 @@ from cavbench.attacks.driving.zo import ZOSignSGD
 from cavbench.core.contracts import Access
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Columns
+from cavbench.defenses.driving.atla import AlternatingTraining
 from cavbench.defenses.driving.pessimist_q import Believing, PessimistQ
 from cavbench.defenses.driving.smoothing import Smoothed
 from cavbench.driving import DrivingAttack, ObservationThreat, Oracle, Policy
 from cavbench.driving.access import DRAWS
 from cavbench.driving.drive import joint
 from cavbench.driving.rollout import NotJointError, rollout
+from cavbench.driving.victims.dqn import DQN
 from cavbench.driving.victims.networks import ActorPolicy, QPolicy
 from cavbench.envs.highway.axes import AXES
 from cavbench.envs.highway.world import HighwayWorld
@@ -139,6 +141,16 @@ def test_units_of_a_smoothed_victim_in_one_batch_have_the_records_that_each_has_
     for column in set(together) - PROBES - {"attack_ms"}:
         np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), column)
     assert (together["queries_max"] % DRAWS == 0).all()
+
+
+@pytest.mark.parametrize("name", ["none", "pgd", "pgd at a preference gap", "plan", "rehearse"])
+def test_units_of_a_driver_with_a_memory_in_one_batch_have_the_records_that_each_has_alone(name: str) -> None:
+    policy = AlternatingTraining().load(DQN(), 0, HIGHWAY.facts)
+    attack = {**ATTACKS, "plan": Plan(steps=2), "rehearse": Rehearse(horizon=1.0)}[name]
+    together = driven(attack, policy, (0, 1), share=0.7)
+    alone = [driven(attack, policy, (unit,), share=0.7) for unit in range(2)]
+    for column in set(together) - PROBES - {"attack_ms"}:
+        np.testing.assert_array_equal(together[column], np.concatenate([one[column] for one in alone]), column)
 
 
 class WithTheBatch(Victim):

@@ -79,15 +79,22 @@ def test_units_that_are_driven_alone_share_nothing(alone: bool, monkeypatch: pyt
     assert seconds < 1.001 * units * own.of(2)
 
 
-def test_a_memory_is_driven_alone_only_where_its_gradients_are_asked_for() -> None:
-    """They depend on the batch, its answers do not; `plan` was not measured behind `atla`."""
+@pytest.mark.parametrize("alone", [True, False])
+def test_a_victim_is_driven_alone_only_where_its_gradients_are_asked_for(
+    alone: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If they depend on the batch, and its answers do not; `plan` was not measured behind `atla`."""
+    known = deepcopy(table())
+    assert not any(costs.get("alone") for costs in known["driving"]["rows"]["dqn+atla"].values())
+    known["driving"]["rows"]["dqn+atla"]["pgd"] |= {"alone": 1.0} if alone else {}
+    monkeypatch.setattr("cavbench.run.cost.table", lambda: known)
     words = ("defense=atla", "threat.access=dynamics", "reference=false")
     pairs = {name: plan_of([f"attack={name}", *words]).pairs[0] for name in ("noise", "zo", "pgd", "plan")}
     assert {name: rates(pair).alone for name, pair in pairs.items()} == {
         "noise": False,
         "zo": False,
-        "pgd": True,
-        "plan": True,
+        "pgd": alone,
+        "plan": alone,
     }
 
 

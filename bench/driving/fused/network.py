@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -20,6 +20,8 @@ ACTIVATIONS: dict[type[nn.Module] | None, int] = {
     nn.Tanh: kernels.TANH,
 }
 
+
+Room = tuple[kernels.Floats, ...]
 
 MANY = 4096
 """Of more points than this a pass keeps nothing for the gradient. Only defences ask so many, and take the least of several
@@ -51,8 +53,11 @@ class Fused:
         "features",
         "size",
         "built",
+        "passes",
     )
     """What the watch compares (`cavbench.isolation.watch.marks`)."""
+    passes: ClassVar[tuple[Callable[..., None], Callable[..., None]]] = kernels.forward, kernels.backward
+    """What computes the answers and their gradient."""
 
     def __init__(
         self,
@@ -64,10 +69,11 @@ class Fused:
         scale: Tensor | None = None,
     ) -> None:
         self.built = tuple(
-            (one, type(one), tuple(one._modules.values()), tuple(one._buffers.values())) for one in network.modules()
+            (one, type(one), tuple(one._modules.values()), tuple(one._buffers.values()), _shapes(one))
+            for one in network.modules()
         )
         linears, kinds = zip(*layers, strict=True)
-        self.modules: tuple[nn.Linear, ...] = (*(encoder or ()), *linears)
+        self.modules: tuple[nn.Module, ...] = (*(encoder or ()), *linears)
         self.scale = scale
         self.widths = np.array([linears[0].in_features, *(one.out_features for one in linears)], np.int64)
         self.kinds = np.array([ACTIVATIONS[kind] for kind in kinds], np.int64)
@@ -85,14 +91,16 @@ class Fused:
         """Dimensions of an observation: [V, F], or [n] without an encoder."""
         return 2 if self.width else 1
 
-    def fits(self, observation: Tensor) -> bool:
-        """Whether it can answer about observations [..., V, F], or [..., n] without an encoder."""
+    def fits(self, observation: Tensor, *more: Tensor) -> bool:
+        """Whether it can answer about observations [..., V, F], or [..., n] without an encoder; it has no other inputs."""
+        if more:
+            return False
         if observation.dtype != torch.float32 or observation.device.type != "cpu" or torch.compiler.is_compiling():
             return False
         shape = observation.shape
         if shape[-1] != self.size or (self.width and shape[-2] < 2) or torch._C._are_functorch_transforms_active():
             return False
-        for module, kind, children, buffers in self.built:
+        for module, kind, children, buffers, _ in self.built:
             own = module.__dict__
             # Hooks count who evaluates the network past the oracle, or are of a defence.
             if (
@@ -114,14 +122,16 @@ class Fused:
         if places != [view.data_ptr() for view in _VIEWS.get(self, ())]:
             if any(weight.dtype != torch.float32 or weight.device.type != "cpu" for weight in weights):
                 return False
+            if any(_shapes(module) != shapes for module, *_, shapes in self.built):
+                return False
             # 0 times infinity is NaN in torch, and left out here.
             if not all(bool(weight.isfinite().all()) for weight in weights):
                 return False
             _VIEWS[self] = [weight.detach().reshape(-1) for weight in weights]
         return True
 
-    def __call__(self, observation: Tensor) -> Tensor:
-        """The answers [..., A] about observations that it `fits`, differentiable once in them."""
+    def __call__(self, observation: Tensor, *more: Tensor) -> Tensor:
+        """The answers [..., A] about inputs that it `fits`, differentiable once in the observations."""
         if observation.requires_grad and torch.is_grad_enabled():
             answer: Tensor = _Pass.apply(observation, self)
             return answer
@@ -139,11 +149,14 @@ class Fused:
         weights = torch.cat(_VIEWS[self]).numpy()
         blocks = -(-count // kernels.LANES) if keeps else 1
         out = np.empty((count, self.outputs), np.float32)
-        kept = np.empty((blocks, self.kept, kernels.LANES), np.float32)
+        given, room = (points, weights, self.form(points.shape[1]), self.widths, self.kinds), self.room(blocks)
+        self.passes[0](*given, out, *room)
+        return torch.from_numpy(out).view(*leading, self.outputs), (*given, *room)
+
+    def room(self, blocks: int) -> Room:
+        """Room for what `kernels.forward` keeps of so many blocks; a single one is used for all."""
         best, chosen = np.empty((2, blocks, self.pooled, kernels.LANES), np.float32)
-        given = points, weights, self.form(points.shape[1]), self.widths, self.kinds
-        kernels.forward(*given, out, kept, best, chosen)
-        return torch.from_numpy(out).view(*leading, self.outputs), (*given, kept, best, chosen)
+        return np.empty((blocks, self.kept, kernels.LANES), np.float32), best, chosen
 
     def backward(self, kept: Any, by_answer: Tensor) -> kernels.Floats:
         """The gradient in the points [N, n], from that in the answers [..., A] and what `forward` gave besides them."""
@@ -153,20 +166,20 @@ class Fused:
         # A second pass forward costs as much as one backward.
         if len(points) <= len(kept[-1]) * kernels.LANES and 2 * len(asked) > len(points):
             by_points = np.empty_like(points)
-            kernels.backward(*kept, by_out, by_points)
+            self.passes[1](*kept, by_out, by_points)
             return by_points
         found = np.zeros_like(points)
         if len(asked):
             some = torch.from_numpy(points[asked])
             again = self.forward(some.view(-1, *self._shape(points.shape[1])), keeps=True)[1]
             by_points = np.empty_like(again[0])
-            kernels.backward(*again, by_out[asked], by_points)
+            self.passes[1](*again, by_out[asked], by_points)
             found[asked] = by_points
         return found
 
     def _shape(self, size: int) -> tuple[int, ...]:
         """The shape of an observation of `size` values."""
-        return (size // self.features, self.features) if self.width else (size,)
+        return (size // self.features, self.features) if self.dimensions == 2 else (size,)
 
     def gathered(self) -> Tensor:
         """All weights in one vector, in the order of `kernels.forward`; the parameters become views of it."""
@@ -199,6 +212,11 @@ class Fused:
 
 _VIEWS: WeakKeyDictionary[Fused, list[Tensor]] = WeakKeyDictionary()
 """The weights as flat vectors. They are kept apart, so that where they lie in memory is no part of what a network is."""
+
+
+def _shapes(module: nn.Module) -> list[torch.Size | None]:
+    """The shapes of a module's own weights; None for one that it lacks."""
+    return [None if weight is None else weight.shape for weight in module._parameters.values()]
 
 
 def chain(network: object) -> Fused | None:

@@ -10,9 +10,8 @@ from torch import Tensor
 
 from cavbench.driving.fused import kernels, learning
 from cavbench.driving.fused.kernels import Floats
-from cavbench.driving.fused.network import Fused
+from cavbench.driving.fused.network import Fused, Room
 
-Room = tuple[Floats, Floats, Floats]
 NO_AVERAGE: Floats = np.empty(0, np.float32)
 
 
@@ -32,7 +31,7 @@ class Trainable:
         self.weights: Floats = fused.gathered().numpy()
         self.by_weights = np.zeros_like(self.weights)
         self.restart()
-        self._room = self._rooms(1)
+        self._room = self.fused.room(1)
 
     def restart(self) -> None:
         """Forget the moments of Adam."""
@@ -41,13 +40,13 @@ class Trainable:
 
     def answers(self, observation: Tensor, *, weights: Floats | None = None) -> Tensor:
         """The answers [N, A] about observations [N, V, F], by default with its own weights."""
-        return self._answers(observation, weights, self._rooms(1))[0]
+        return self._answers(observation, weights, self.fused.room(1))[0]
 
     def forward(self, observation: Tensor, *, weights: Floats | None = None) -> Tensor:
         """As `answers`; `backward` is about this call."""
         blocks = -(-len(observation) // kernels.LANES)
         if len(self._room[0]) < blocks:
-            self._room = self._rooms(blocks)
+            self._room = self.fused.room(blocks)
         out, self._pass = self._answers(observation, weights, self._room)
         return out
 
@@ -76,8 +75,3 @@ class Trainable:
         self.steps += 1
         moments = self.first, self.second, self.steps
         learning.adam(self.weights, self.by_weights, *moments, rate, self.eps, longest, average, tau)
-
-    def _rooms(self, blocks: int) -> Room:
-        """Room for what `kernels.forward` keeps of so many blocks; a single one is used for all."""
-        best, chosen = np.empty((2, blocks, self.fused.pooled, kernels.LANES), np.float32)
-        return np.empty((blocks, self.fused.kept, kernels.LANES), np.float32), best, chosen

@@ -48,7 +48,7 @@ class QNetwork(nn.Module):
         super().__init__()
         self.encoder = Encoder(features)
         self.head = _head(self.encoder.out_features, actions + 1, hidden)
-        self.fused = Fused(self, _layers(self.head), encoder=self.encoder.layers, dueling=True)
+        self.fused = Fused(self, layers_of(self.head), encoder=self.encoder.layers, dueling=True)
 
     def forward(self, observation: Tensor) -> Tensor:
         value, advantage = self.head(self.encoder(observation)).tensor_split([1], -1)
@@ -62,7 +62,7 @@ class StateValue(nn.Module):
         super().__init__()
         self.encoder = Encoder(features)
         self.head = _head(self.encoder.out_features, 1, hidden)
-        self.fused = Fused(self, _layers(self.head), encoder=self.encoder.layers)
+        self.fused = Fused(self, layers_of(self.head), encoder=self.encoder.layers)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.head(self.encoder(observation))
@@ -88,8 +88,8 @@ def whatever_the_batch(network: nn.Module, observation: Tensor, *more: Tensor) -
         return network(observation, *more)
     fused = getattr(network, "fused", None)
     # A training has torch's numbers, also those of its target networks.
-    if isinstance(fused, Fused) and not (more or network.training) and fused.fits(observation):
-        return fused(observation)
+    if isinstance(fused, Fused) and not network.training and fused.fits(observation, *more):
+        return fused(observation, *more)
     leading = observation.shape[:-2]
     missing = FEW - leading.numel()
     if not 0 < missing < FEW:
@@ -144,7 +144,7 @@ class Actor(nn.Module):
         self.head = _head(self.encoder.out_features, 2, hidden)
         self.limit: Tensor
         self.register_buffer("limit", limit, persistent=False)
-        self.fused = Fused(self, _layers(self.head, nn.Tanh), encoder=self.encoder.layers, scale=limit)
+        self.fused = Fused(self, layers_of(self.head, nn.Tanh), encoder=self.encoder.layers, scale=limit)
 
     def forward(self, observation: Tensor) -> Tensor:
         return self.head(self.encoder(observation)).tanh() * self.limit
@@ -169,7 +169,7 @@ class Critic(nn.Module):
         return (found * last.weight[0]).sum(-1, keepdim=True) + last.bias
 
 
-def _layers(head: MLP, last: type[nn.Module] | None = None) -> list[tuple[nn.Linear, type[nn.Module] | None]]:
+def layers_of(head: MLP, last: type[nn.Module] | None = None) -> list[tuple[nn.Linear, type[nn.Module] | None]]:
     """The linear layers of a head, each with the activation after it; `last` follows the last one."""
     linears = [layer for layer in head if isinstance(layer, nn.Linear)]
     return [*((linear, nn.ReLU) for linear in linears[:-1]), (linears[-1], last)]

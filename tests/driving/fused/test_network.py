@@ -195,9 +195,15 @@ def another_class(network: nn.Module) -> None:
     getattr(parent, name).__class__ = Halved
 
 
+def without_bias(network: nn.Module) -> None:
+    parent, name = linears(network)[-1]
+    getattr(parent, name).bias = None
+
+
 CHANGES: dict[str, Callable[[nn.Module], object]] = {
     "first layer": lambda network: another_layer(network, 0),
     "last layer": lambda network: another_layer(network, -1),
+    "bias": without_bias,
     "activations": another_activation,
     "hooks of activations": clipped_activations,
     "forward": another_forward,
