@@ -65,7 +65,7 @@ def test_nothing_is_left_for_the_next_unit(name: str, who: str) -> None:
         assert stacked() == before
 
 
-@pytest.mark.parametrize("name", STACKED.keys() - {"inference mode"})
+@pytest.mark.parametrize("name", sorted(STACKED.keys() - {"inference mode"}))
 def test_a_victim_is_not_asked_under_a_mode_of_the_attack(name: str) -> None:
 
     def ask(observation: Tensor, oracle: Oracle) -> None:
