@@ -7,6 +7,7 @@ nothing in them is executed, and nothing outside of them is read.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -191,11 +192,19 @@ def _check_scalar(event: yaml.ScalarEvent, path: Path) -> None:
         # Python reads signs, zeros in front and underscores as the command line does.
         same = re.fullmatch(r"[+-]?[0-9]+(_[0-9]+)*", text) is not None and int(text) == value
     else:
-        same = not isinstance(value, float) or ":" not in text
+        # Of what Python does not read as that number, such as 1:30.5 and 0_., the command line makes a text.
+        same = not isinstance(value, float) or not math.isfinite(value) or _number(text) == value
     if not same:
         raise UserError(
             f"{path}: YAML reads {short(text)} as {_word(value, text, path)}; write that, or '{text}' in quotes for the text"
         )
+
+
+def _number(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def write(out: Path, words: Mapping[str, str]) -> Path:

@@ -60,7 +60,16 @@ def test_a_path_with_spaces_and_signs_is_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("written", "read_as"),
-    [("010", "8"), ("0x10", "16"), ("0b11", "3"), ("1:30", "90"), ("1:30.5", "90.5"), ("no", "false"), ("On", "true")],
+    [
+        ("010", "8"),
+        ("0x10", "16"),
+        ("0b11", "3"),
+        ("1:30", "90"),
+        ("1:30.5", "90.5"),
+        ("0_.", "0.0"),
+        ("no", "false"),
+        ("On", "true"),
+    ],
 )
 def test_a_value_that_yaml_takes_for_another_is_refused(tmp_path: Path, written: str, read_as: str) -> None:
     path = made(tmp_path, study=f"attack: noise\nepisodes: {written}\n")
