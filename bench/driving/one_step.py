@@ -27,7 +27,7 @@ from cavbench.scenarios import Cell
 
 ROUNDING = 1e-5
 """A share of a range may be so far outside of [-1, 1]."""
-DONE = ("actuator", "traffic", "dynamics")
+ON_THE_ROAD = ("actuator", "traffic", "dynamics")
 """Sets of a threat model that change what cars do, which nobody who looks at observations alone can carry out."""
 
 
@@ -81,7 +81,7 @@ class Session:
         threat: Any = pair.threat
         assert isinstance(world, DrivingWorld)
         assert isinstance(threat, ObservationThreat)
-        if beyond := [name for name in sets.present(threat) if name in DONE]:
+        if beyond := [name for name in sets.present(threat) if name in ON_THE_ROAD]:
             raise UserError(
                 f"threat.{beyond[0]} changes what cars do, not what is observed: only a run carries it out "
                 "(cavbench.score or bench run)"

@@ -17,7 +17,7 @@ from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.ego import DeadReckoning, predicted
 from cavbench.driving.intervals.kernels import Flags, Floats
 from cavbench.driving.intervals.mask import compilable
-from cavbench.driving.intervals.repeats import distinct
+from cavbench.driving.intervals.repeats import answered
 
 
 class Belief:
@@ -78,10 +78,11 @@ class Belief:
         if torch.is_grad_enabled() and observation.requires_grad:
             scores: Tensor = _Score.apply(observation, assumed, tracks, ego, *given)
             return scores
-        if one := distinct(observation, tracks, ego):
-            found = _score(one.observation, assumed, one.tracks, one.ego, *given, sloped=False)[0]
-            return found[one.place].view(*observation.shape[:-2], network.outputs)
-        return _score(observation, assumed, tracks, ego, *given, sloped=False)[0]
+
+        def answer(shown: Tensor, moved: Tensor | None, own: Tensor) -> Tensor:
+            return _score(shown, assumed, moved, own, *given, sloped=False)[0]
+
+        return answered(answer, observation, tracks, ego)
 
     def believe(
         self, shown: Floats, there: Flags, ego: Tensor, low: Floats, high: Floats, signs: Tensor

@@ -17,7 +17,7 @@ from cavbench.driving.intervals import box_kernels, filter_kernels, judge_kernel
 from cavbench.driving.intervals.boxes import Assumed, Boxes, flat
 from cavbench.driving.intervals.ego import predicted
 from cavbench.driving.intervals.kernels import Flags, Floats
-from cavbench.driving.intervals.repeats import distinct
+from cavbench.driving.intervals.repeats import answered
 
 
 class Weighed(NamedTuple):
@@ -120,10 +120,11 @@ class Mask:
         if torch.is_grad_enabled() and observation.requires_grad:
             scores: Tensor = _Score.apply(observation, assumed, tracks, ego, self, network)
             return scores
-        if one := distinct(observation, tracks, ego):
-            found = _score(one.observation, assumed, one.tracks, one.ego, self, network, sloped=False)[0]
-            return found[one.place].view(*observation.shape[:-2], network.outputs)
-        return _score(observation, assumed, tracks, ego, self, network, sloped=False)[0]
+
+        def answer(shown: Tensor, moved: Tensor | None, own: Tensor) -> Tensor:
+            return _score(shown, assumed, moved, own, self, network, sloped=False)[0]
+
+        return answered(answer, observation, tracks, ego)
 
     def weigh(self, shown: Floats, present: Flags, ego: Tensor, low: Floats, high: Floats) -> tuple[Any, ...]:
         """The fields of `Weighed` for N observations and their boxes, and what `weigh_backward` needs, on arrays."""

@@ -5,6 +5,7 @@ A rehearsal asks under several lies at once. Where no car is in the lane that tw
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,17 @@ class Distinct(NamedTuple):
     tracks: Tensor | None
     ego: Tensor
     place: Tensor
+
+
+def answered(
+    answer: Callable[[Tensor, Tensor | None, Tensor], Tensor], observation: Tensor, tracks: Tensor | None, ego: Tensor
+) -> Tensor:
+    """The answers [..., A] about observations [..., V, F] with their tracks and egos; those that repeat are asked about once."""
+    one = distinct(observation, tracks, ego)
+    if one is None:
+        return answer(observation, tracks, ego)
+    found = answer(one.observation, one.tracks, one.ego)
+    return found[one.place].view(*observation.shape[:-2], found.shape[-1])
 
 
 def distinct(observation: Tensor, tracks: Tensor | None, ego: Tensor) -> Distinct | None:
