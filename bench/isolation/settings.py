@@ -96,9 +96,7 @@ def _modules() -> dict[str, object]:
     """The modules of the framework, and those that scores are computed with."""
     # Thousands are imported, and hardly one is ours: the quick question comes first.
     ours = {
-        name: module
-        for name, module in sys.modules.items()
-        if name.startswith(OWN) and name.partition(".")[0] == OWN
+        name: module for name, module in sys.modules.items() if name.startswith(OWN) and name.partition(".")[0] == OWN
     }
     return ours | {name: sys.modules[name] for name in LIBRARIES if name in sys.modules}
 

@@ -102,7 +102,9 @@ def _records(runs: tuple[int, int]) -> tuple[pa.Table, list[tuple[int, int]]]:
                 # Each training has a network of its own: equal ones would be compared, drive by drive, in every study.
                 place = part.schema.get_field_index("weights_sha256")
                 weights = [f"{victim + 1} {seed}" for seed in part["training_seed"].to_pylist()]
-                part = part.set_column(place, part.schema.field(place), pa.array(weights, part.schema.field(place).type))
+                part = part.set_column(
+                    place, part.schema.field(place), pa.array(weights, part.schema.field(place).type)
+                )
             parts.append(part)
             kinds.append((victim, attack))
     parts.append(drive("blind", victim_params={"policy": "slower"}, sees=False, runs=(0,), **common))
