@@ -70,6 +70,7 @@ class Options:
             raise UserError(f"{empty[0]} has an empty value; write {empty[0]}={paths[empty[0]]}")
         self.values: dict[str, tuple[str, ...]] = {}
         self.broken: dict[str, str] = {}
+        self._made: dict[Kind, list[Chosen[Any]]] = {}
         for override in _parsed([word for key, word in zip(keys, words, strict=True) if key not in paths]):
             key = override.key_or_group
             self._check_key(key)
@@ -148,13 +149,18 @@ class Options:
         return next(iter(found))
 
     def chosen(self, kind: Kind) -> list[Chosen[Any]]:
-        """The chosen components of a kind, with every combination of their parameter values.
+        """The chosen components of a kind, with every combination of their parameter values; each is made once.
 
         Broken plug-ins are left out, if there is another component: see `broken`.
 
         Raises:
             UserError: if a component or a parameter is unknown, a value is not allowed, or every component is broken.
         """
+        if kind not in self._made:
+            self._made[kind] = self._make(kind)
+        return list(self._made[kind])
+
+    def _make(self, kind: Kind) -> list[Chosen[Any]]:
         names = self.values.get(kind) or (track(self.track).world if kind == "world" else DEFAULTS[kind],)
         # Hydra's grammar escapes the colon of NAME:CHOICE.
         names = tuple(name.replace("\\:", ":") for name in names)

@@ -94,7 +94,8 @@ def unchanged() -> Iterator[None]:
         # Nothing says whether it waits to end the process.
         faulthandler.cancel_dump_traceback_later()
         changed = RECURSION if lowered != limit else before.changed()
-        before.restore()
+        if changed:
+            before.restore()
         # A filter of the foreign code stays, but hides no line of ours.
         warnings.simplefilter("always", Notice)
     if changed:

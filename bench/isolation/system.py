@@ -25,6 +25,7 @@ PR_GET_PDEATHSIG, PR_GET_CHILD_SUBREAPER = 2, 37
 TIMERS = tuple(
     getattr(signal, name) for name in ("ITIMER_REAL", "ITIMER_VIRTUAL", "ITIMER_PROF") if hasattr(signal, name)
 )
+SIGNALS = tuple(signal.valid_signals())
 OUTPUT = (0, 1, 2)
 """The descriptors of the standard streams."""
 
@@ -47,7 +48,7 @@ def _mask() -> int:
 
 
 def _handlers() -> dict[int, object]:
-    return {number: signal.getsignal(number) for number in signal.valid_signals()}
+    return {number: signal.getsignal(number) for number in SIGNALS}
 
 
 def _put_handlers(before: Mapping[int, Any]) -> None:

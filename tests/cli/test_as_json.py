@@ -24,10 +24,19 @@ def read(said: Said, code: int = 0) -> dict[str, Any]:
     return made
 
 
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that the first test fills."""
+    return tmp_path_factory.mktemp("driven") / "results"
+
+
 @pytest.fixture
-def driven(bench: Bench, tmp_path: Path) -> tuple[dict[str, Any], Path]:
-    out = tmp_path / "results"
-    return read(bench("run", "attack=nudge,noise", *TOY, f"out={out}", "--json")), out
+def driven(bench: Bench, results: Path) -> tuple[dict[str, Any], Path]:
+    """What the run said that filled the folder, and the folder, which tests only read."""
+    said = results.with_name("said.json")
+    if not said.exists():
+        said.write_text(json.dumps(read(bench("run", "attack=nudge,noise", *TOY, f"out={results}", "--json"))))
+    return json.loads(said.read_text()), results
 
 
 def test_a_run_says_every_pair_its_control_and_the_baselines(driven: tuple[dict[str, Any], Path]) -> None:

@@ -19,7 +19,7 @@ from cavbench.run.task import Task
 ATTACKS = ("bias", "pgd")
 RUN = (
     f"attack={','.join(ATTACKS)} defense=frame_stack victim=dqn lanes=3 density=1 weather=clear episodes=3 seeds=0 "
-    "reference=false"
+    "reference=false world.max_steps=60"
 )
 
 

@@ -97,12 +97,15 @@ def _records(runs: tuple[int, int]) -> tuple[pa.Table, list[tuple[int, int]]]:
     for victim, (defense, count) in enumerate(zip(("none", "advtrain"), runs, strict=True)):
         for attack, name in enumerate(("none", "zo", "pgd")):
             queries = 40.0 * bool(attack)
-            weights = f"{victim + 1}" if count else ""
-            parts.append(
-                drive(
-                    attack=name, defense=defense, runs=range(max(count, 1)), queries=queries, weights=weights, **common
+            part = drive(attack=name, defense=defense, runs=range(max(count, 1)), queries=queries, **common)
+            if count:
+                # Each training has a network of its own: equal ones would be compared, drive by drive, in every study.
+                place = part.schema.get_field_index("weights_sha256")
+                weights = [f"{victim + 1} {seed}" for seed in part["training_seed"].to_pylist()]
+                part = part.set_column(
+                    place, part.schema.field(place), pa.array(weights, part.schema.field(place).type)
                 )
-            )
+            parts.append(part)
             kinds.append((victim, attack))
     parts.append(drive("blind", victim_params={"policy": "slower"}, sees=False, runs=(0,), **common))
     return pa.concat_tables(parts), [*kinds, (2, 0)]

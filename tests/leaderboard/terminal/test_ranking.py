@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import io
 import re
+from collections.abc import Callable
 
 import pyarrow as pa
 import pytest
 from rich.console import Console
 
 from cavbench.leaderboard.published import every_track
-from cavbench.leaderboard.ranking.boards import read_boards
-from cavbench.leaderboard.terminal.ranking import flags_report, leaderboard_report
+from cavbench.leaderboard.ranking.boards import Board, read_boards
+from cavbench.leaderboard.ranking.worlds import over_several
+from cavbench.leaderboard.terminal.ranking import flags_report, leaderboard_report, print_boards
+from cavbench.leaderboard.terminal.worlds import print_worlds
 from tests.leaderboard.synthetic import CLEAR, approach, drive, probed
 
 LONG = {"behind": "tracker+shield"}
@@ -22,18 +25,30 @@ def published() -> dict[str, pa.Table]:
     return every_track()
 
 
-def printed(report: object, records: dict[str, pa.Table], width: int) -> str:
+@pytest.fixture(scope="module")
+def boards(published: dict[str, pa.Table]) -> list[Board]:
+    """Those of the published records: reading them takes most of the time of a report."""
+    return read_boards(published)[0]
+
+
+def ranking(boards: list[Board], console: Console) -> None:
+    """As `leaderboard_report`, of boards that are read already."""
+    print_boards(boards, console)
+    print_worlds(over_several(boards), console)
+
+
+def printed(report: Callable[..., None], of: object, width: int) -> str:
     console = Console(file=io.StringIO(), width=width)
-    report(records, console)  # type: ignore[operator]
+    report(of, console)
     return console.file.getvalue()  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("width", [80, 100, 140])
-def test_no_name_of_the_published_rows_is_broken(published: dict[str, pa.Table], width: int) -> None:
-    text = printed(leaderboard_report, published, width)
+def test_no_name_of_the_published_rows_is_broken(boards: list[Board], width: int) -> None:
+    text = printed(ranking, boards, width)
     assert max(map(len, text.splitlines())) <= width
     words = set(text.split())
-    for board in read_boards(published)[0]:
+    for board in boards:
         for row in board.rows:
             for kind in ("defense", "victim", "attack"):
                 assert str(row.identity[kind]) in words
@@ -47,9 +62,9 @@ def test_a_ranking_of_seventeen_rows_has_no_sentences_about_each_row(published: 
     assert "`bench report flags`" in text
 
 
-def test_a_row_of_one_patch_has_no_rank(published: dict[str, pa.Table]) -> None:
+def test_a_row_of_one_patch_has_no_rank(published: dict[str, pa.Table], boards: list[Board]) -> None:
     detection = {"detection": published["detection"]}
-    rows = [row for board in read_boards(detection)[0] for row in board.rows]
+    rows = [row for board in boards if board.track.name == "detection" for row in board.rows]
     assert {row.one_patch for row in rows} == {True, False}
     assert all((row.group == 0) == (len(row.worst.scores) == 1) for row in rows)
     said = " ".join(printed(leaderboard_report, detection, 120).split())
