@@ -167,6 +167,10 @@ class StopSignPhotos(CameraWorld):
         scenes = _scenes(Path(self.path).expanduser(), self.side, self.field_of_view, self.sha256)
         return [Approach(seed=seed, location=self.locations[0], scenes=scenes) for seed in seeds]
 
+    def scenarios(self, cell: Cell) -> int | None:
+        """See `World.scenarios`."""
+        return 1
+
     def doubts(self, cells: object) -> tuple[str, ...]:
         # It is called before anything is driven, so bad pictures are named then.
         self.approaches(AXES.cell(light="as_taken"), range(1))
