@@ -63,8 +63,8 @@ def _check_scenarios(task: Task) -> None:
         there = world.component.scenarios(cell)
         if there is not None and there < task.episodes:
             raise UserError(
-                f"world {world} has {there} scenario{'s' if there > 1 else ''} in the cell {cell}, and more episodes would repeat "
-                f"them as if they were others: episodes={there}, not {task.episodes}"
+                f"world {world} has {there} scenario{'s' if there > 1 else ''} in the cell {cell}, and more episodes would "
+                f"repeat them as if they were others: episodes={there}, not {task.episodes}"
             )
 
 
