@@ -140,6 +140,16 @@ class World(Component):
         """The facts in a cell, where they depend on it: a range may follow from the number of lanes."""
         return self.facts
 
+    def scenarios(self, cell: Any) -> int | None:
+        """How many scenarios a cell has: those of so many seeds in a row differ, and further seeds repeat them.
+
+        None if every seed is another one. More episodes than scenarios are refused: an interval would count each several times.
+
+        Raises:
+            UserError: if the world cannot be driven in this cell.
+        """
+        return None
+
     def doubts(self, cells: Sequence[Any]) -> Sequence[str]:
         """What makes scores in these cells doubtful, one line each; a run says it before it drives. It may take seconds.
 

@@ -25,7 +25,8 @@ class CameraWorld(World):
 
     track: ClassVar[str] = "detection"
     locations: ClassVar[tuple[str, ...]]
-    """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`."""
+    """Names of the places; scenario seed s is driven at `locations[s % len(locations)]`. If nothing but the place depends on the
+    seed, `scenarios` returns their number."""
     redraws: ClassVar[bool] = False
     mounts: ClassVar[bool] = False
     """Whether its scenes show patches of other shapes and places, too (`Scenes.mounted`)."""

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -15,6 +17,9 @@ from cavbench.detection.colour import linear, srgb
 from cavbench.detection.printing import LEAST, MOST
 from cavbench.errors import UserError
 
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
 LARGEST_BYTES, LARGEST_PIXELS = 200_000_000, 150_000_000
 """Of a picture that is read."""
 FLAT = 0.005
@@ -24,7 +29,7 @@ PER_TEXEL = 6
 
 
 def opened(path: Path) -> NDArray[np.uint8]:
-    """A picture [H, W, 3], sRGB, turned as its camera says.
+    """A picture [H, W, 3], turned as its camera says, in sRGB: converted from its colour profile, if it has one.
 
     Raises:
         UserError: if there is none, it is too large, or cannot be decoded.
@@ -39,12 +44,31 @@ def opened(path: Path) -> NDArray[np.uint8]:
         with Image.open(path, formats=("PNG", "JPEG", "TIFF", "BMP", "WEBP")) as image:
             if image.width * image.height > LARGEST_PIXELS:
                 raise UserError(f"{path} has {image.width} x {image.height} pixels, at most 150 million are read")
-            return np.asarray(ImageOps.exif_transpose(image).convert("RGB"))
+            return np.asarray(_in_srgb(ImageOps.exif_transpose(image), path))
     except UserError:
         raise
     # The decoders raise anything for a truncated or forged file.
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, ValueError, SyntaxError, EOFError) as error:
         raise UserError(f"cannot read the picture {path}: {str(error).splitlines()[0][:200]}") from None
+
+
+def _in_srgb(image: Image, path: Path) -> Image:
+    """A picture in RGB, of sRGB: telephones and scanners write wider gamuts. Without a profile its numbers count as sRGB."""
+    from PIL import ImageCms
+
+    profile = image.info.get("icc_profile")
+    if not profile:
+        return image.convert("RGB")
+    if image.mode not in ("L", "RGB", "RGBA", "CMYK"):
+        image = image.convert("L" if image.mode == "LA" else "RGB")
+    try:
+        own = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        found = ImageCms.profileToProfile(image, own, ImageCms.createProfile("sRGB"), outputMode="RGB")
+    except (ImageCms.PyCMSError, OSError, ValueError, TypeError):
+        found = None
+    if found is None:
+        raise UserError(f"{path} has a colour profile that cannot be read: save it in sRGB")
+    return found
 
 
 def read(picture: NDArray[np.uint8], texels: int) -> Tensor:

@@ -56,6 +56,18 @@ def tried(task: Task) -> tuple[tuple[str, str], tuple[str, ...]]:
     return (weights, pair.adversary_sha256(seed)), lines
 
 
+def _check_scenarios(task: Task) -> None:
+    """Raise UserError if a cell has fewer scenarios than episodes: its interval would count some of them several times."""
+    world = task.pair.world
+    for cell in task.cells:
+        there = world.component.scenarios(cell)
+        if there is not None and there < task.episodes:
+            raise UserError(
+                f"world {world} has {there} scenario{'s' if there > 1 else ''} in the cell {cell}, and more episodes would "
+                f"repeat them as if they were others: episodes={there}, not {task.episodes}"
+            )
+
+
 def _doubts(task: Task) -> tuple[str, ...]:
     """What makes the scores doubtful, one line each.
 
@@ -64,4 +76,6 @@ def _doubts(task: Task) -> tuple[str, ...]:
     """
     world = task.pair.world
     of_world = world.component.doubts(task.cells) if task.asks_world else ()
+    if task.asks_world:
+        _check_scenarios(task)
     return (*(f"world {world}: {line}" for line in of_world), *track_of(task.pair).doubts(task.pair))

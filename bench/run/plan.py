@@ -138,7 +138,9 @@ class Plan:
             for seed in self._training_seeds(pair):
                 world = canonical([pair.world.name, pair.world.params])
                 unit = self._unit(pair, seed)
-                task = Task(unit=unit, step="load", cells=cells, asks_world=world not in asked)
+                task = Task(
+                    unit=unit, step="load", cells=cells, episodes=self.grid.episodes, asks_world=world not in asked
+                )
                 found.setdefault(unit.networks, task)
                 asked.add(world)
         return tuple(found.values())

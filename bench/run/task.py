@@ -41,6 +41,7 @@ class Task:
         entropy: seed of the probes of a replay; None draws one, which nobody can foresee.
         others: units to drive in the same batch (`cavbench.run.batches`).
         cells: of a loading, the cells of the run, whose observations the network is tried on.
+        episodes: of a loading, how many each of these cells has.
         asks_world: of a loading, whether to ask the world, too, what it doubts about these cells; one loading of a world does.
     """
 
@@ -51,6 +52,7 @@ class Task:
     entropy: int | None = None
     others: Sequence[Unit] = ()
     cells: tuple[Cell, ...] = ()
+    episodes: int = 0
     asks_world: bool = False
 
     @property

@@ -17,6 +17,7 @@ from cavbench.envs.camera.bank import BankScenes
 from cavbench.envs.camera.objects import NAMES
 from cavbench.envs.camera.poses import Pose
 from cavbench.errors import UserError
+from cavbench.scenarios import Cell
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,6 +47,10 @@ class BankWorld(CameraWorld):
     def place(self, seed: int) -> str:
         """Name of the place that a scenario seed is driven at."""
         return self.locations[seed % len(self.locations)]
+
+    def scenarios(self, cell: Cell) -> int | None:
+        """See `World.scenarios`: one for each place."""
+        return len(self.locations)
 
     def on_road(self, location: str, lanes: int, density: float, weather: str) -> BankScenes:
         """The frames of the approach at a place, farthest first.

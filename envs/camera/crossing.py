@@ -59,6 +59,10 @@ class StopSignCrossing(BankWorld):
         """Those of the world `camera`."""
         return StopSignApproach().training_scenes()
 
+    def scenarios(self, cell: Cell) -> int | None:
+        """See `World.scenarios`: every seed has another cross traffic."""
+        return None
+
     def approaches(self, cell: Cell, seeds: range) -> list[Approach]:
         """All seeds of a weather and a lens have the same frames; they differ in the cross traffic."""
         scenes = _scenes(self.folder, str(cell.weather), str(cell.lens))

@@ -44,6 +44,8 @@ LEAST_PIXELS = 12.0
 """Width of a sign that can be scored."""
 OFF = 0.06
 """How far the corners may be from those of a flat octagon in perspective, as a share of the sign's width."""
+BETTER = 0.75
+"""The corners begin at a wrong one if, from another one on, what the sign leaves unexplained is less than this share."""
 STRIDE = 32
 
 
@@ -165,6 +167,10 @@ class StopSignPhotos(CameraWorld):
         scenes = _scenes(Path(self.path).expanduser(), self.side, self.field_of_view, self.sha256)
         return [Approach(seed=seed, location=self.locations[0], scenes=scenes) for seed in seeds]
 
+    def scenarios(self, cell: Cell) -> int | None:
+        """See `World.scenarios`."""
+        return 1
+
     def doubts(self, cells: object) -> tuple[str, ...]:
         # It is called before anything is driven, so bad pictures are named then.
         self.approaches(AXES.cell(light="as_taken"), range(1))
@@ -274,22 +280,44 @@ def _lit(picture: NDArray[np.uint8], corners: NDArray[np.float64], path: Path) -
         raise UserError(
             f"{path}: the sign is {min(x1 - x0, y1 - y0)} pixels wide at this side, at least {LEAST_PIXELS:g} are needed"
         )
-    fitted, _ = cv2.findHomography(corners, OCTAGON, 0)
-    matrix = np.asarray(np.eye(3) if fitted is None else fitted, np.float64)
-    if fitted is None or float(np.abs(_through(matrix, corners) - OCTAGON).max()) > OFF:
+    matrix = _onto_face(corners)
+    if float(np.abs(_through(matrix, corners) - OCTAGON).max()) > OFF:
         raise UserError(f"{path}: the corners are not those of a flat octagon in perspective")
     crop = (int(x0), int(y0), int(x1), int(y1))
     planes = torch.from_numpy(picture).permute(2, 0, 1).contiguous()
     light = develop.light_of(planes[:, y0:y1, x0:x1] / 255)
-    reflected = texture_mean(crop, filtered(sign.painted(None, 1.0), detail(crop))[0], matrix)
-    inside = wholly_sign(crop, matrix)
-    black, gain = zip(*(_line(reflected[c][inside], light[c][inside]) for c in range(3)), strict=True)
+    reflected, inside, black, gain, left = _explained(light, crop, matrix)
+    # An octagon fits in eight ways: only the letters say which way the patch is up.
+    turned = [_explained(light, crop, _onto_face(np.roll(corners, -first, 0)))[-1] for first in range(1, len(OCTAGON))]
+    if min(turned) < BETTER * left:
+        first = turned.index(min(turned)) + 2
+        raise UserError(
+            f"{path}: the letters fit if the corners begin with x{first},y{first}: the left end of the upper edge is x1,y1"
+        )
     if min(gain) <= 0.02:
         raise UserError(f"{path}: what is inside the corners is no red sign with white letters")
     levels, slopes = (torch.tensor(each).view(3, 1, 1) for each in (black, gain))
     shade = _shade(light, levels + slopes * reflected, inside)
     box = (*corners.min(0).tolist(), *corners.max(0).tolist())
     return Photo(planes, crop, np.asarray(matrix, np.float64), levels, slopes * shade, box)
+
+
+def _onto_face(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Homography [3, 3] from the corners [8, 2] of a sign to those of its face."""
+    fitted, _ = cv2.findHomography(corners, OCTAGON, 0)
+    return np.asarray(np.eye(3) if fitted is None else fitted, np.float64)
+
+
+def _explained(
+    light: Tensor, crop: Box, matrix: NDArray[np.float64]
+) -> tuple[Tensor, Tensor, tuple[float, ...], tuple[float, ...], float]:
+    """The face of the sign on a crop, where it is wholly seen, black and gain of each channel, and the mean light left over."""
+    reflected = texture_mean(crop, filtered(sign.painted(None, 1.0), detail(crop))[0], matrix)
+    inside = wholly_sign(crop, matrix)
+    black, gain = zip(*(_line(reflected[c][inside], light[c][inside]) for c in range(3)), strict=True)
+    levels, slopes = (torch.tensor(each).view(3, 1) for each in (black, gain))
+    left = float((light[:, inside] - levels - slopes * reflected[:, inside]).abs().mean())
+    return reflected, inside, black, gain, left
 
 
 def _line(reflected: Tensor, light: Tensor) -> tuple[float, float]:

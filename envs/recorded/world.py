@@ -141,6 +141,10 @@ class RecordedWorld(RoadsWorld):
 
         return RecordedDynamics(self.config(cells, Control(action_type=action_type)))
 
+    def scenarios(self, cell: Cell) -> int | None:
+        """See `World.scenarios`: one for each start."""
+        return len(self.scene(cell).recordings.starts)
+
     def doubts(self, cells: Sequence[Cell]) -> Sequence[str]:
         # It is called before anything is driven, so a scene that is missing or unfit is named then.
         for cell in dict.fromkeys(cell.replaced(weather="clear") for cell in cells):

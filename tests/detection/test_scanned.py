@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, ImageCms
 
 from cavbench.detection import paper, printout, scanned
 from cavbench.detection.colour import linear, srgb
@@ -131,3 +131,21 @@ def test_bad_files_are_one_line(tmp_path: Path) -> None:
             paper.run(action, [str(tmp_path / name)], out | values, Console())
         assert len(str(refused.value).splitlines()) == 1
     assert not list(tmp_path.glob("o.*"))
+
+
+def test_a_picture_is_read_in_the_colours_of_its_profile(tmp_path: Path) -> None:
+    profile = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    entries = [
+        profile[start : start + 12] for start in range(132, 132 + 12 * int.from_bytes(profile[128:132], "big"), 12)
+    ]
+    red, blue = (int.from_bytes(one[4:8], "big") for one in entries if one[:4] in (b"rXYZ", b"bXYZ"))
+    # Red and blue change places, in the profile and in the picture.
+    profile[red : red + 20], profile[blue : blue + 20] = profile[blue : blue + 20], profile[red : red + 20]
+    wanted = (TEXELS * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+    picture = Image.fromarray(np.ascontiguousarray(wanted[..., ::-1]))
+    for mode in ("RGB", "RGBA"):
+        picture.convert(mode).save(tmp_path / "a.png", icc_profile=bytes(profile))
+        assert np.array_equal(scanned.opened(tmp_path / "a.png"), wanted)
+    picture.save(tmp_path / "a.png", icc_profile=b"no profile")
+    with pytest.raises(UserError, match="colour profile"):
+        scanned.opened(tmp_path / "a.png")

@@ -12,6 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from cavbench.core import sets
 from cavbench.core.pair import Pair
 from cavbench.core.progress import share_done
 from cavbench.core.track import Certified
@@ -68,6 +69,10 @@ class Certifier:
         assert isinstance(world, DrivingWorld)
         assert isinstance(threat, ObservationThreat)
         assert isinstance(victim, DrivingVictim)
+        if beyond := list(sets.present(threat)):
+            raise UserError(
+                f"bounds are of changed values, this threat model allows more than that: leave out threat.{beyond[0]}"
+            )
         self.world, self.threat, self.facts = world, threat, world.facts_at(cells[0])
         self.pair, self.training_seed = pair, training_seed
         self.cells, self.seeds = list(cells), list(seeds)

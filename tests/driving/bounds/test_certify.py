@@ -7,6 +7,7 @@ import torch
 from cavbench.core.pair import Pair, choose
 from cavbench.core.track import Job, track
 from cavbench.driving.bounds import networks
+from cavbench.driving.sets import Actuator, Held, Latency, Presence, Traffic
 from cavbench.driving.threat import ObservationThreat
 from cavbench.errors import UserError
 
@@ -62,6 +63,23 @@ def test_more_courses_than_may_be_driven_give_no_score() -> None:
     assert found.given_up.all()
     assert (found.bound == 0).all()
     assert (found.linear < 0.2).all()
+
+
+@pytest.mark.parametrize(
+    "beyond",
+    [
+        {"presence": Presence(hidden=2)},
+        {"latency": Latency(frames=3)},
+        {"held": Held(share=0.1, longest=3)},
+        {"actuator": Actuator(replaced=0.5)},
+        {"traffic": Traffic(cars=1)},
+    ],
+    ids=lambda beyond: next(iter(beyond)),
+)
+def test_an_attack_that_may_change_more_than_values_has_no_bound(beyond: dict[str, object]) -> None:
+    """With a budget of 0 everything would be proven, whatever is hidden, late or executed."""
+    with pytest.raises(UserError, match=rf"leave out threat\.{next(iter(beyond))}"):
+        certified(pair("noise", defense="none", budget=0.0, **beyond))  # type: ignore[arg-type]
 
 
 def test_a_bound_that_an_attack_refutes_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:

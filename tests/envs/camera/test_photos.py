@@ -128,6 +128,7 @@ def test_bad_pictures_are_one_line(tmp_path: Path) -> None:
 
     assert "outside the picture" in tried(good + np.array([2000, 0]))
     assert "clockwise" in tried(good[::-1])
+    assert "begin with x3,y3" in tried(np.roll(good, 2, 0))
     dented = good.copy()
     dented[0] = good.mean(0)
     assert "without a dent" in tried(dented)
@@ -146,3 +147,25 @@ def test_bad_pictures_are_one_line(tmp_path: Path) -> None:
     assert "name of a file in the folder" in refused(tmp_path)
     (tmp_path / LIST).unlink()
     assert "there is no" in refused(tmp_path)
+
+
+@pytest.mark.parametrize("width", [14, 60])
+def test_corners_that_begin_at_another_one_would_turn_the_patch(width: int, tmp_path: Path) -> None:
+    scenes = rendered()
+    picture, good = taken(scenes, 9), corners(scenes, 9)
+    share = width / np.ptp(good[:, 0])
+    size = tuple(round(each * share) for each in picture.shape[1::-1])
+    smaller = np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+    places = good * share
+    for first in range(1, 8):
+        folder = write(tmp_path, {"a.png": (smaller, np.roll(places, first, 0))})
+        with pytest.raises(UserError, match=f"begin with x{first + 1},y{first + 1}"):
+            StopSignPhotos(path=str(folder), side=max(size)).approaches(CELL, range(1))
+    StopSignPhotos(path=str(write(tmp_path, {"a.png": (smaller, places)})), side=max(size)).approaches(CELL, range(1))
+
+
+def test_the_example_in_the_docs_is_a_sign() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "worlds" / "photos.md").read_text()
+    (line,) = (line.strip() for line in page.splitlines() if "street.jpg," in line)
+    shown = np.array([float(each) for each in line.split(",")[1:]]).reshape(8, 2)
+    assert np.abs(shown - corners(rendered(), FRAMES[0])).max() < 0.1

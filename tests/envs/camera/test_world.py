@@ -5,12 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cavbench.core.registry import grid_of
+from cavbench.detection import CameraWorld
 from cavbench.envs.camera import poses
 from cavbench.envs.camera.axes import AXES
 from cavbench.envs.camera.bank import SHIPPED
+from cavbench.envs.camera.places import StopSignPlaces
 from cavbench.envs.camera.street.layout import LOCATIONS
 from cavbench.envs.camera.world import StopSignApproach
 from cavbench.envs.weather import WEATHERS
+from tests.command import Bench
 
 WORLD = StopSignApproach()
 
@@ -39,3 +43,22 @@ def test_all_frames_are_under_80_mb() -> None:
 def test_a_road_that_was_not_rendered_is_one_line() -> None:
     with pytest.raises(ValueError, match="lanes must be one of 3, 4, 5, got 6"):
         AXES.cell(lanes=6, density=1.0, weather="clear")
+
+
+@pytest.mark.parametrize("world", [StopSignApproach(), StopSignPlaces()], ids=["camera", "places"])
+def test_a_place_is_a_scenario_and_further_seeds_repeat_them(world: CameraWorld) -> None:
+    cell = grid_of(world).cells()[0]
+    count = world.scenarios(cell)
+    assert count is not None
+    shown = [one.scenes.render(torch.tensor([9]), None, 0.5) for one in world.approaches(cell, range(count + 1))]
+    assert all(not torch.equal(shown[0], other) for other in shown[1:count])
+    assert torch.equal(shown[0], shown[count])
+
+
+def test_more_episodes_than_places_are_refused(bench: Bench) -> None:
+    """Three times the same three approaches would have an interval that is a third as wide."""
+    said = bench("run", "world=camera", "victim=fcos", "attack=none", "weather=clear", "episodes=4", "reference=false")
+    assert said.code != 0
+    assert len(said.err.strip().splitlines()) == 1
+    assert "has 3 scenarios in the cell" in said.err
+    assert "episodes=3, not 4" in said.err

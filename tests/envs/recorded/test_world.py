@@ -240,6 +240,28 @@ def test_every_scene_is_a_file_that_fetch_brings() -> None:
     assert set(SCENES.values()) == {path.name for path in places("ngsim")}
 
 
+def test_a_start_is_a_scenario_and_further_seeds_repeat_them(path: Path) -> None:
+    world = RecordedWorld(path=str(path))
+    count = world.scenarios(cell_of(world))
+    assert count is not None
+    engine = RoadsEngine(world.config((cell_of(world),) * (count + 1), Control()))
+    engine.reset(np.arange(count + 1), SEEDS[0] + np.arange(count + 1))
+    starts = list(zip(engine.episodes["begin"].tolist(), engine.episodes["taken"].tolist(), strict=True))
+    assert len(set(starts[:count])) == count
+    assert starts[count] == starts[0]
+
+
+def test_more_episodes_than_starts_are_refused(bench: Bench, path: Path) -> None:
+    world = RecordedWorld(path=str(path))
+    count = world.scenarios(cell_of(world))
+    assert count is not None
+    words = ("run", "world=recorded", f"world.path={path}", "victim=idm", "attack=none", f"episodes={count + 1}")
+    said = bench(*words)
+    assert said.code != 0
+    assert len(said.err.strip().splitlines()) == 1
+    assert f"episodes={count}, not {count + 1}" in said.err
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
