@@ -31,8 +31,9 @@ def is_aside(lane: LaneRecord, x: float, y: float) -> bool:
     if lane.kind == CIRCULAR:
         off_x, off_y = x - lane.center_x, y - lane.center_y
         square = off_x * off_x + off_y * off_y
-        beside = (square < lane.inside) | (square > lane.outside)
-        return beside | (off_x * lane.middle_x + off_y * lane.middle_y < lane.least_x)
+        along = off_x * lane.middle_x + off_y * lane.middle_y
+        # One comparison instead of three, which cannot be predicted.
+        return max(lane.inside - square, square - lane.outside, lane.least_x - along) > 0.0
     across = (y - lane.start_y) * lane.direction_x - (x - lane.start_x) * lane.direction_y
     return abs(across) - abs(lane.amplitude) > lane.width / 2 + lane.margin + SURELY
 
@@ -41,7 +42,7 @@ def is_aside(lane: LaneRecord, x: float, y: float) -> bool:
 def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
     """Whether a body is on a lane or within its margin, and where, in m."""
     lane = road.lanes[number]
-    if number != body.lane and is_aside(lane, body.x, body.y):
+    if (number != body.lane) & is_aside(lane, body.x, body.y):
         return False, 0.0
     along, across = coordinates_on(road, body, number)
     return is_on(lane, along, across, lane.margin), along
@@ -50,6 +51,8 @@ def place_on(road: Road, body: Body, number: int) -> tuple[bool, float]:
 @inlined
 def place_near(road: Road, body: Body, number: int) -> tuple[bool, float]:
     """`place_on` a lane or those linked to it."""
+    if road.lanes[number].linked == 1:
+        return place_on(road, body, number)
     for link in range(road.lanes[number].linked):
         found, along = place_on(road, body, road.linked[number, link])
         if found:
