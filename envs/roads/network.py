@@ -142,7 +142,7 @@ class LaneRecord:
     middle_x: float  # direction from the centre to the middle of the arc
     middle_y: float
     least_x: float  # m along that direction, the least of the same bodies
-    alone_from: float  # m along it, from where to `alone_to` only this lane can be the closest to a body within `NEAR` of it
+    alone_from: float  # m along it; to `alone_to` no other lane can be closer to a body within `NEAR` of it
     alone_to: float  # m
     linked: int  # how many lanes are searched for its neighbours, itself included
 
