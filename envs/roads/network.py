@@ -396,7 +396,7 @@ def _near(lanes: Sequence[Lane], spacing: float = 0.5) -> tuple[NDArray[np.int8]
         close[number] = False
         found = np.flatnonzero(close.any(1))
         table[number, : len(found)] = found
-        stretches.append(_longest(along, ~close.any(0)))
+        stretches.append(_longest(along, np.logical_not(close.any(0))))
     return table, stretches
 
 
