@@ -35,7 +35,7 @@ from cavbench.envs.roads.state import (
     Parameters,
     Road,
 )
-from cavbench.envs.roads.traffic import act, lane_distance
+from cavbench.envs.roads.traffic import act, lane_distance, new_places
 
 LOOK_AHEAD_S = 0.8
 """A car aims for the lane in which it will be after so many seconds."""
@@ -195,7 +195,7 @@ def follow_ego(
     road: Road, bodies: Bodies, row: Floats, clipped: NDArray[np.bool_], parameters: Parameters, trial: Bodies
 ) -> None:
     """Give the ego of the last belief the action that explains what is measured now [4]; `trial` [1] is a work array."""
-    found, least = IDLE, np.inf
+    found, least, places = IDLE, np.inf, new_places(road.lane_count, 1)
     for number in range(5):
         # IDLE first: it wins a tie.
         action = (number + IDLE) % 5
@@ -203,7 +203,7 @@ def follow_ego(
         ego = trial[0]
         apply_meta_action(road, ego, action, parameters)
         for _ in range(parameters.substeps):
-            act(road, trial, 1, parameters)
+            act(road, trial, 1, parameters, places)
             move(road, ego, parameters.dt)
         error = abs(ego.speed * ego.cos_heading - row[2]) + abs(ego.speed * ego.sin_heading - row[3])
         error += 0.0 if clipped[0] else abs(ego.x - row[0])

@@ -79,5 +79,5 @@ def find_collisions(bodies: Bodies, cars: int, dt: float, corners: Floats) -> No
         reach = 6.0 + max(first.speed * dt, 0.0)
         for other in range(number + 1, bodies.size):
             second = bodies[other]
-            if abs(second.x - first.x) < reach and abs(second.y - first.y) < reach:
+            if max(abs(second.x - first.x), abs(second.y - first.y)) < reach:
                 collide(first, second, dt, corners)

@@ -34,6 +34,7 @@ from cavbench.envs.roads.simulation import advance
 from cavbench.envs.roads.state import (
     BODY,
     EPISODE,
+    PLACE,
     Bodies,
     Body,
     Episode,
@@ -45,7 +46,7 @@ from cavbench.envs.roads.state import (
     Road,
     ViewKind,
 )
-from cavbench.envs.roads.traffic import lane_distance, neighbours
+from cavbench.envs.roads.traffic import find_places, lane_distance, neighbours_in
 
 MOST_SIDE_LANES = 16
 OF_SCENE = (
@@ -185,7 +186,9 @@ def score(
 def time_to_collision(road: Road, bodies: Bodies, episode: Episode) -> float:
     """Seconds until the ego hits the body ahead in its lane at their current speeds; inf if never."""
     ego = bodies[episode.ego]
-    leader, _ = neighbours(road, bodies, episode.ego, ego.lane)
+    on_lane = np.empty(1 + bodies.size, PLACE)
+    find_places(road, bodies, ego.lane, on_lane)
+    leader, _ = neighbours_in(on_lane, episode.ego, ego.along)
     if leader < 0:
         return np.inf
     other = bodies[leader]

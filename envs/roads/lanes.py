@@ -143,12 +143,15 @@ def heading_distance(lane: LaneRecord, x: float, y: float, heading: float, least
 def update_lane(body: Body, road: Road) -> None:
     """RoadNetwork.get_closest_lane_index: set the lane of a body and its place on it; the first lane wins a tie.
 
-    The lane of the frame before is tried first. While the body is close to it, only the lanes near that one may be closer.
+    The lane of the frame before is tried first. While the body is close to it, only the lanes near that one may be closer,
+    and none where that lane is alone: there all others are farther than `NEAR`.
     """
     best = before = body.lane
-    least, along, across = heading_distance(road.lanes[before], body.x, body.y, body.heading, np.inf)
+    lane = road.lanes[before]
+    least, along, across = heading_distance(lane, body.x, body.y, body.heading, np.inf)
     close = least <= NEAR
-    for place in range(road.lane_count):
+    alone = close and lane.alone_from <= along <= lane.alone_to
+    for place in range(0 if alone else road.lane_count):
         number: int = np.int64(road.near[before, place]) if close else place  # type: ignore[assignment]
         if number < 0:
             break

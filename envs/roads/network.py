@@ -142,6 +142,8 @@ class LaneRecord:
     middle_x: float  # direction from the centre to the middle of the arc
     middle_y: float
     least_x: float  # m along that direction, the least of the same bodies
+    alone_from: float  # m along it; to `alone_to` no other lane can be closer to a body within `NEAR` of it
+    alone_to: float  # m
     linked: int  # how many lanes are searched for its neighbours, itself included
 
 
@@ -352,7 +354,8 @@ def record(
     table = np.zeros(1, dtype=ROAD)
     road = table[0]
     road["lane_count"], road["edge_count"], road["end"] = lanes, len(roads), end
-    road["factor"], road["reach"], road["near"] = factor, _reach(roads), _near(network.lanes())
+    road["factor"], road["reach"] = factor, _reach(roads)
+    road["near"], alone = _near(network.lanes())
     road["spots"][: len(spots)] = spots
     road["routes"] = road["route_lanes"] = -1
     if way is not None:
@@ -365,6 +368,7 @@ def record(
             _fill(place, lane)
             linked = network.linked(start, last, own)
             place["edge"], place["number"], place["linked"] = edge, own, len(linked)
+            place["alone_from"], place["alone_to"] = alone[number]
             for link, (other, offset) in enumerate(linked):
                 road["linked"][number, link], road["offsets"][number, link] = other, offset
             for goal, name in enumerate(destinations):
@@ -376,22 +380,33 @@ def record(
     return table
 
 
-def _near(lanes: Sequence[Lane], spacing: float = 0.5) -> NDArray[np.int8]:
+def _near(lanes: Sequence[Lane], spacing: float = 0.5) -> tuple[NDArray[np.int8], list[tuple[float, float]]]:
     """[MOST_LANES, MOST_LANES] for each lane the numbers of those that may be closer to a body within `NEAR` of it, then -1.
 
     A lane is left out if it is surely farther than `NEAR` from every such place. Points `spacing` m apart are checked.
+    The list has the longest stretch of each lane, in m, on which all others are left out; from inf to -inf if there is none.
     """
     table = np.full((MOST_LANES, MOST_LANES), -1, dtype=np.int8)
+    stretches = []
     for number, lane in enumerate(lanes):
-        points = _points(lane, np.linspace(0.0, lane.length, 2 + int(lane.length / spacing)))
+        along = np.linspace(0.0, lane.length, 2 + int(lane.length / spacing))
+        points = _points(lane, along)
         reach = NEAR + abs(lane.amplitude) + spacing / 2 + NEAR
-        found = [
-            other
-            for other, beside in enumerate(lanes)
-            if other != number and _distance(beside, points).min() - abs(beside.amplitude) <= reach
-        ]
+        close = np.array([_distance(other, points) - abs(other.amplitude) <= reach for other in lanes])
+        close[number] = False
+        found = np.flatnonzero(close.any(1))
         table[number, : len(found)] = found
-    return table
+        stretches.append(_longest(along, np.logical_not(close.any(0))))
+    return table, stretches
+
+
+def _longest(along: NDArray[np.float64], free: NDArray[np.bool_]) -> tuple[float, float]:
+    """The first and last m of the longest run of points that are `free`; inf and -inf without one."""
+    ends = np.flatnonzero(np.diff(free, prepend=False, append=False))
+    if not len(ends):
+        return np.inf, -np.inf
+    longest = np.argmax(ends[1::2] - ends[::2])
+    return float(along[ends[2 * longest]]), float(along[ends[2 * longest + 1] - 1])
 
 
 def _points(lane: Lane, along: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from cavbench.envs.roads.lanes import update_lane
 from cavbench.envs.roads.motion import move, update_direction
 from cavbench.envs.roads.recordings import Reaction, Recordings, TrackRecord
 from cavbench.envs.roads.state import Bodies, Body, Episode, Floats, Kind, Parameters, Road
-from cavbench.envs.roads.traffic import act
+from cavbench.envs.roads.traffic import act, new_places
 
 IDM, OBSTACLE, RECORDED = int(Kind.IDM), int(Kind.OBSTACLE), int(Kind.RECORDED)
 REPLAY, REACTIVE = int(Reaction.REPLAY), int(Reaction.REACTIVE)
@@ -180,9 +180,10 @@ def advance(
     recordings: Recordings,
 ) -> None:
     """Drive some frames among recorded traffic."""
+    places = new_places(road.lane_count, bodies.size)
     for _ in range(frames):
         release_all(road, bodies, episode, recordings, parameters)
-        act(road, bodies, episode.cars, parameters)
+        act(road, bodies, episode.cars, parameters, places)
         episode.frames += 1
         for number in range(episode.cars):
             body = bodies[number]

@@ -140,8 +140,16 @@ class Episode:
     truncated: bool
 
 
+class Place:
+    """A body on a lane or within its margin; the first of a row has no place, but the number of those after it."""
+
+    body: int  # its number
+    along: float  # m on the lane
+
+
 BODY = record_type(Body)
 EPISODE = record_type(Episode)
+PLACE = record_type(Place)
 
 
 class Bodies(Protocol):
@@ -155,6 +163,18 @@ class Bodies(Protocol):
     def __getitem__(self, number: slice) -> Bodies: ...
     def copy(self) -> Bodies: ...
     def __setitem__(self, number: slice, bodies: Bodies) -> None: ...
+
+
+class OnLane(Protocol):
+    """The bodies on one lane in compiled code: an array [1 + N] of `PLACE`."""
+
+    def __getitem__(self, number: int) -> Place: ...
+
+
+class Places(Protocol):
+    """The bodies on each lane in compiled code: an array [L, 1 + N] of `PLACE`."""
+
+    def __getitem__(self, lane: int) -> OnLane: ...
 
 
 class Lanes(Protocol):
