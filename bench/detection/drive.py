@@ -173,8 +173,8 @@ class Common:
         ]
         parts = []
         for _, group in groupby(range(len(patches)), alike.__getitem__):
-            places = list(group)
-            first, end = places[0], places[-1] + 1
+            first, *others = group
+            end = first + len(others) + 1
             part = replace(job, seeds=job.seeds[first:end])
             own = [seed for seed in traced if seed in part.seeds]
             known = unpatched.at(first, end)

@@ -30,6 +30,8 @@ from cavbench.detection.drive import drive, drive_jointly
 from cavbench.detection.patch import Patch, written_together
 from cavbench.detection.victims.yolov3_tiny import YOLOv3Tiny
 from cavbench.envs.camera.environment import ApproachEnv
+from cavbench.run.batches import batches
+from cavbench.run.task import Task
 from cavbench.run.unit import Unit
 from cavbench.scenarios import Axes, Axis, Cell
 from tests.detection.growing_signs import GrowingScenes, SquareDetector
@@ -105,7 +107,7 @@ class Made(DetectorVictim):
         return MADE[self.kind]().eval()
 
 
-def job(kind: str, attack: str = "none", knows: str = "universal", **values: float) -> Job:
+def unit(kind: str, attack: str = "none", knows: str = "universal", **values: float) -> Unit:
     pair = Pair(
         attack=choose("attack", attack),
         defense=choose("defense", "none"),
@@ -114,8 +116,12 @@ def job(kind: str, attack: str = "none", knows: str = "universal", **values: flo
         threat=PatchThreat(budget=0.75, knows=knows) if attack != "none" else PatchThreat(budget=0, queries=0),
     )
     cell = GrowingStreet.axes.cell(**values)
-    unit = Unit(pair=pair, training_seed=0, weights_sha256="", cell=cell, seeds=SEEDS)
-    return replace(unit.job, artefact="" if attack == "none" else attack)
+    return Unit(pair=pair, training_seed=0, weights_sha256="", cell=cell, seeds=SEEDS)
+
+
+def job(kind: str, attack: str = "none", knows: str = "universal", **values: float) -> Job:
+    found = unit(kind, attack, knows, **values).job
+    return replace(found, artefact="" if attack == "none" else attack)
 
 
 def files(jobs: Sequence[Job]) -> dict[str, bytes]:
@@ -180,6 +186,17 @@ def test_units_come_together_if_they_differ_in_attack_and_speed_alone() -> None:
     ]
     assert alike[0] == alike[1]
     assert len(set(alike)) == 3
+
+
+def test_speeds_of_a_pair_are_not_parted_however_many_workers_there_are() -> None:
+    units = [unit("squares", attack, speed=speed) for speed in (8.0, 10.0, 12.0) for attack in ("noise_patch", "eot")]
+    for workers in (1, 16):
+        found = batches([Task(unit=one) for one in units], (), workers)
+        assert sorted(map(len, found)) == [3, 3]
+        assert {len({task.unit.pair.id for task in batch}) for batch in found} == {1}
+    # Where there is much to do, pairs come together, too.
+    many = [replace(one, seeds=range(start, start + 4)) for one in units for start in range(0, 40, 4)]
+    assert sorted(map(len, batches([Task(unit=one) for one in many], (), 1))) == [6] * 10
 
 
 def test_a_patch_for_a_scene_is_that_of_every_speed_and_is_looked_at_once() -> None:
