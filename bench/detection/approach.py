@@ -83,10 +83,10 @@ class Unpatched:
     least: Sequence[NDArray[np.float32] | None]
     faces: Sequence[Sight | None]
 
-    def at(self, approach: int) -> Unpatched:
-        """That of one approach."""
-        number = self.of_approach[approach]
-        own = [self.scenes[number]], np.zeros(1, np.int64)
+    def at(self, first: int, end: int) -> Unpatched:
+        """That of the approaches from `first` to `end`, which have the same scenes."""
+        number = self.of_approach[first]
+        own = [self.scenes[number]], np.zeros(end - first, np.int64)
         return Unpatched(*own, [self.decoys[number]], [self.least[number]], [self.faces[number]])
 
     @classmethod

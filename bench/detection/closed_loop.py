@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import hashlib
+from collections.abc import Mapping, MutableMapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,7 +15,7 @@ from cavbench.detection import stopping
 from cavbench.detection.boxes import overlap
 from cavbench.detection.detector import Detections, Detector
 from cavbench.detection.driver import Memory
-from cavbench.detection.sight import SAME_IOU, glance
+from cavbench.detection.sight import SAME_IOU, Sight, glance
 
 STANDS_MPS = 1e-3
 """A slower car stands still."""
@@ -155,7 +156,9 @@ class Drives:
 
 
 @torch.no_grad()
-def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Drive:
+def drive(
+    detector: Detector, env: DrivingEnv, draws: Sequence[int] = (), seen: MutableMapping[str, Sight] | None = None
+) -> Drive:
     """Let a detector drive the car of an environment of one car (`CameraWorld.environment`) until its episode ends.
 
     Each new frame is shown to the detector, with the distance driven since the one before. The stop signs that it detects go to
@@ -165,6 +168,8 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
         detector: the (defended) victim.
         env: the environment.
         draws: numbers of the draws of the cross traffic whose positions are kept.
+        seen: what the detector saw in other drives, by what was shown; it grows. A frame in it is not looked at again, unless the
+            detector has a memory.
 
     Raises:
         UserError: if a prediction is NaN or infinite.
@@ -177,13 +182,20 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
     remembered, looked_at = detector.initial(), now["info"]["distance"][:, 0]
     start_m, confirmed_m, false_m = float(looked_at), 0.0, 0.0
     moments: list[Moment] = []
+    shared = None if detector.remembers else seen
     while len(moments) < MOST_STEPS:
         info = now["info"]
         distance, speed, frame = float(info["distance"]), float(info["speed"]), int(info["frame"])
         driven = start_m - distance
         if sight is None or frame != memory.frame:
             moved, looked_at = looked_at - info["distance"][:, 0], info["distance"][:, 0]
-            sight, remembered = glance(detector, now["observation"], info["box"], moved, remembered)
+            key = "" if shared is None else _shown(now["observation"], info["box"])
+            if shared is not None and key in shared:
+                sight = shared[key]
+            else:
+                sight, remembered = glance(detector, now["observation"], info["box"], moved, remembered)
+            if shared is not None:
+                shared[key] = sight
             known = len(memory.confirmed)
             # The image is of the nearest frame, not of the place of the car.
             memory = memory.seeing(sight.found[0].boxes, frame, start_m - float(info["shown"]))
@@ -213,6 +225,11 @@ def drive(detector: Detector, env: DrivingEnv, draws: Sequence[int] = ()) -> Dri
         now = env.step(now.set("action", env.action_spec.project(torch.tensor([[asked]]))))["next"]
         memory = memory.after(env.step_s)
     return Drive(tuple(moments), env.step_s, confirmed_m, false_m)
+
+
+def _shown(picture: torch.Tensor, box: torch.Tensor) -> str:
+    """Equal for frames with the same pixels and the same box of the sign."""
+    return hashlib.sha256(picture.numpy().tobytes() + box.numpy().tobytes()).hexdigest()
 
 
 MEASURED = (

@@ -97,6 +97,13 @@ class Detector(nn.Module, ABC):
             raise ValueError(f"pictures must be {wanted}, got {list(pictures.shape)}")
         return self.predict(pictures)
 
+    @property
+    def remembers(self) -> bool:
+        """Whether what it reports on a frame may depend on the frames before: it, or one that it is made of, has an `advance`."""
+        plain = (Detector.advance, Wrapped.advance)
+        parts = (part for part in self.modules() if isinstance(part, Detector))
+        return any(getattr(part.advance, "__func__", None) not in plain for part in parts)
+
     def initial(self) -> Any:
         """What is remembered before the first frame of an approach; None for a detector without a memory."""
         return None

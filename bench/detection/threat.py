@@ -77,9 +77,9 @@ class PatchThreat(ThreatModel):
             case "universal":
                 return None
             case "site":
-                return axes.unperceived(cell)
+                return axes.looked_at(axes.unperceived(cell))
             case "scene":
-                return cell
+                return axes.looked_at(cell)
 
     def confine(self, texels: Tensor) -> Tensor:
         """The allowed texels for texels [..., 3, P, P] without NaN: clipped to [0, 1], and printable with norm `print`."""

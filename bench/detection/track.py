@@ -368,7 +368,8 @@ class DetectionTrack(Track):
     def alike(self, job: Job) -> Hashable | None:
         attacked = ("attack", "attack_params")
         apart = tuple(value for name, value in job.pair.identity.items() if name not in attacked)
-        return (apart, job.training_seed, job.attack_seed, tuple(job.cell.items()), job.seeds, job.device)
+        seen = job.pair.world.component.facts.axes.looked_at(job.cell)
+        return (apart, job.training_seed, tuple(seen.items()), job.seeds, job.device)
 
     def drive_jointly(self, jobs: Sequence[Job], artefacts: Mapping[str, bytes]) -> Sequence[Driven] | None:
         from cavbench.detection.drive import drive_jointly

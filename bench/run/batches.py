@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Hashable, Sequence
 
 from cavbench.run.task import Task
+from cavbench.run.unit import Unit
 
 EPISODES = 400
 """Most episodes in one batch: an operation on more does not fit into the processor's cache."""
@@ -14,6 +15,8 @@ TASKS = 4
 
 def batches(tasks: Sequence[Task], recorded: Collection[str], workers: int) -> list[list[Task]]:
     """The tasks in batches of units that are alike (`Track.alike`); alone, what cannot be driven together.
+
+    Units of a pair with the same frames are never parted: together they take little longer than one.
 
     Args:
         tasks: of a unit each, in the order in which they should begin.
@@ -30,5 +33,23 @@ def batches(tasks: Sequence[Task], recorded: Collection[str], workers: int) -> l
     found: list[list[Task]] = []
     for group in alike.values():
         size = max(1, min(most, EPISODES // len(group[0].unit.seeds)))
-        found += [group[start : start + size] for start in range(0, len(group), size)]
+        parts: dict[object, list[Task]] = {}
+        for place, task in enumerate(group):
+            frames = None if task.step != "drive" else _frames(task.unit)
+            parts.setdefault(place if frames is None else frames, []).append(task)
+        batch: list[Task] = []
+        for part in parts.values():
+            if batch and len(batch) + len(part) > size:
+                found.append(batch)
+                batch = []
+            batch = [*batch, *part]
+        found.append(batch)
     return found
+
+
+def _frames(unit: Unit) -> Hashable | None:
+    """Equal for units of a pair whose cells have the same frames; None in a world where all cells have others."""
+    axes = unit.pair.world.component.facts.axes
+    if not any(axis.unseen for axis in axes.axes):
+        return None
+    return unit.pair.id, unit.training_seed, tuple(axes.looked_at(unit.cell).items()), unit.seeds

@@ -26,6 +26,8 @@ class Axis:
         default: value of cells that leave it out; None if every cell must give one.
         perceptual: whether it changes only what is observed, as fog does. Input-independent policies are driven at its first
             value only.
+        unseen: whether it changes nothing that a camera sees, as the speed of a car does: detectors look once at frames of cells
+            that differ in it alone.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Axis:
     choices: tuple[Value, ...] = ()
     default: Value | None = None
     perceptual: bool = False
+    unseen: bool = False
 
     def checked(self, value: Value) -> Value:
         """Convert a value to the type of the axis.
@@ -198,6 +201,11 @@ class Axes(Mapping[str, Axis]):
         """The cell with every perceptual axis at its first value, in which input-independent policies are driven."""
         first = {axis.name: axis.choices[0] for axis in self.axes if axis.perceptual and axis.choices}
         return cell.replaced(**first)
+
+    def looked_at(self, cell: Cell) -> Cell:
+        """The cell with every unseen axis at its default: equal for cells with the same frames."""
+        usual = {axis.name: axis.default for axis in self.axes if axis.unseen and axis.default is not None}
+        return cell.replaced(**usual)
 
     def place(self, cell: Cell) -> tuple[tuple[float, str], ...]:
         """Sort key of a cell: perceptual axes first, so that tables are grouped by weather."""

@@ -22,6 +22,7 @@ AXES = Axes(
             low=4.0,
             high=14.0,
             default=10.0,
+            unseen=True,
         ),
         LENS,
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from cavbench.core.track import Driven, Job, track
 from cavbench.detection import Detector, DetectorVictim, PatchThreat, Predictions
 from cavbench.detection.closed_loop import drive as drive_car
 from cavbench.detection.closed_loop import measured
-from cavbench.detection.drive import drive
+from cavbench.detection.drive import drive, drive_jointly
 from cavbench.detection.patch import Patch
 from cavbench.envs.camera import sign
 from cavbench.envs.camera.crossing import StopSignCrossing
@@ -56,19 +57,34 @@ class RedPlate(Detector):
         return Predictions(torch.stack(boxes)[:, None], torch.tensor(found).view(shape), torch.ones(*shape, 1))
 
 
+class Blind(Detector):
+    """Sees nothing, and counts the images that it is asked about."""
+
+    names = ("stop sign",)
+    stride = 1
+    asked: ClassVar[int] = 0
+
+    def predict(self, pictures: Tensor) -> Predictions:
+        Blind.asked += len(pictures)
+        shape = (len(pictures), 1)
+        return Predictions(torch.zeros(*shape, 4), torch.zeros(shape), torch.ones(*shape, 1))
+
+
 @dataclass(frozen=True, kw_only=True)
-class RedPlateVictim(DetectorVictim):
-    """The victim of `RedPlate`."""
+class ToyVictim(DetectorVictim):
+    """The victim of `RedPlate`, or of `Blind`."""
+
+    blind: bool = False
 
     def load(self, seed: int, facts: Facts) -> Detector:
-        return RedPlate().eval()
+        return (Blind() if self.blind else RedPlate()).eval()
 
 
-def job(speed: float = 10.0) -> Job:
+def job(speed: float = 10.0, blind: bool = False) -> Job:
     pair = Pair(
         attack=choose("attack", "grey_patch"),
         defense=choose("defense", "none"),
-        victim=Chosen(kind="victim", name="red_plate", component=RedPlateVictim(), code="test"),
+        victim=Chosen(kind="victim", name="red_plate", component=ToyVictim(blind=blind), code="test"),
         world=choose("world", "crossing"),
         threat=PatchThreat(budget=1.0),
     )
@@ -186,6 +202,21 @@ def test_the_film_shows_camera_and_road_side_by_side(attacked: Driven, tmp_path:
     assert not np.array_equal(road, second[:, 770:])
     save(film, tmp_path / "drive.webp", seconds=(0, 0.5))
     assert Image.open(tmp_path / "drive.webp").n_frames == 5
+
+
+def test_three_speeds_ask_about_little_more_than_one() -> None:
+    """They see the same frames: 75 with the patch, 75 decoys, 75 faces, nine probes, and 75 in the loop."""
+    jobs = [job(speed, blind=True) for speed in CROSSING_V2.values["speed"]]
+    assert len({track("detection").alike(one) for one in jobs}) == 1
+    Blind.asked = 0
+    alone = drive(jobs[1], None, ())
+    once, Blind.asked = Blind.asked, 0
+    together = drive_jointly(jobs, {})
+    assert together is not None
+    assert Blind.asked == once
+    assert once == 4 * 75 + 9
+    for name, values in alone.columns.items():
+        np.testing.assert_array_equal(together[1].columns[name], values, err_msg=name)
 
 
 def test_speeds_outside_of_the_axis_are_refused_in_one_line() -> None:

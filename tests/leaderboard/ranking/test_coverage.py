@@ -14,7 +14,7 @@ from tests.leaderboard.simulated_studies import BAD, DESIGNS, EQUAL, STUDIES, ca
 
 COUNT, FEWER = 150, 50
 LEAST, MOST = binom.ppf(0.0005, COUNT, 0.94), COUNT - 1
-"""Hits that a coverage of 94 to 97 % leaves likely. With 39 % there are fewer. Intervals twice as wide hit each time (99.99 %)."""
+"""Hits that a coverage of 94 to 97 % leaves likely. With 39 % there are fewer. Intervals twice as wide always hit (99.99 %)."""
 
 
 @pytest.mark.parametrize("runs", [3, 10])
