@@ -12,6 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cavbench.detection.colour import linear, srgb
+from cavbench.detection.printing import LEAST, MOST
+
 PROFILE = "sRGB IEC61966-2.1"
 """The colour profile in the PDF: the printer's driver converts from it."""
 MARK, GAP = 1 / 8, 1 / 32
@@ -49,9 +52,17 @@ def places() -> tuple[tuple[float, float], ...]:
     return (GAP, GAP), (far, GAP), (far, far), (GAP, far)
 
 
+def on_page(texels: Tensor) -> Tensor:
+    """The colours to print, sRGB, so that the paper reflects the texels [..., 3, P, P], sRGB, or the nearest that it can.
+
+    White is paper, which reflects `MOST`, and black is the ink, which reflects `LEAST`: what lies between is stretched.
+    """
+    return srgb(((linear(texels) - LEAST) / (MOST - LEAST)).clamp(0, 1))
+
+
 def parts(texels: Tensor) -> list[Part]:
     """The patch [3, P, P] and its marks."""
-    coded = (texels.clamp(0, 1) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+    coded = (on_page(texels) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
     inset = MARK + 2 * GAP
     found = [Part(coded, inset, inset, 1.0)]
     for number, (x, y) in enumerate(places()):

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image, ImageCms
 
-from cavbench.detection import paper, printout, scanned
+from cavbench.detection import paper, printing, printout, scanned
 from cavbench.detection.colour import linear, srgb
 from cavbench.detection.patch import Patch
 from cavbench.detection.printing import LEAST, MOST
@@ -21,8 +21,8 @@ from cavbench.errors import UserError
 from cavbench.terminal import Console
 
 TEXELS = torch.rand(3, 24, 24, generator=torch.Generator().manual_seed(3)).mul(255).round().div(255)
-REFLECTED = srgb(LEAST + (MOST - LEAST) * linear(TEXELS))
-"""What paper and ink of the model of printing reflect of them."""
+REFLECTED = srgb(linear(TEXELS).clamp(LEAST, MOST))
+"""What paper and ink can reflect of them."""
 
 
 def seen(page: NDArray[np.uint8], *, tilt: float = 0.0, light: float = 1.0, noise: float = 0.0) -> NDArray[np.uint8]:
@@ -45,6 +45,15 @@ def seen(page: NDArray[np.uint8], *, tilt: float = 0.0, light: float = 1.0, nois
 def test_a_page_is_read_back(change: dict[str, float], most: float) -> None:
     found = scanned.read(seen(printout.raster(TEXELS, 600), **change), 24)
     assert float((found - REFLECTED).abs().mean()) < most
+
+
+def test_a_patch_that_can_be_printed_is_what_the_paper_shows() -> None:
+    """`threat.norm=print` has taken paper and ink into account: they must not take contrast from the patch a second time."""
+    printable = printing.printed(TEXELS)
+    found = scanned.read(seen(printout.raster(printable, 600)), 24)
+    assert float((found - printable).abs().mean()) < 0.02
+    white = srgb(torch.full((3, 24, 24), MOST))
+    assert torch.allclose(printout.on_page(white), torch.ones(3, 24, 24), atol=1e-3), "it is the paper"
 
 
 @pytest.mark.parametrize("turn", [1, 2, 3])
@@ -79,7 +88,7 @@ def test_the_pdf_has_the_texels_the_size_and_the_profile(tmp_path: Path) -> None
     assert height == pytest.approx(300 * printout.WHOLE + printout.NOTE_MM, abs=0.01)
     assert printout.PROFILE.encode() in content
     streams = [zlib.decompress(one) for one in re.findall(rb"stream\n(.*?)\nendstream", content, re.S)]
-    coded = (TEXELS * 255).to(torch.uint8).permute(1, 2, 0).contiguous().numpy().tobytes()
+    coded = (printout.on_page(TEXELS) * 255).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy().tobytes()
     assert coded in streams
     assert any(one[36:40] == b"acsp" for one in streams), "an ICC profile"
     side = 300 * printout.POINTS_MM
