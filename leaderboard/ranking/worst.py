@@ -221,12 +221,20 @@ class Worst:
     @cached_property
     def score(self) -> Interval:
         """The headline: over all runs, cells and scenarios. After a race, lower by what that may hide (`Panel.hidden`)."""
-        return _lowered(share_interval(self.scores), self.panel.hidden)
+        return _lowered(share_interval(self._of_places(self.scores)), self.panel.hidden)
 
     @cached_property
     def failure(self) -> Interval | None:
         """The share of episodes that fail; None where the track has no failure."""
-        return share_interval(self.failed) if self.most.track.failure else None
+        return share_interval(self._of_places(self.failed)) if self.most.track.failure else None
+
+    def _of_places(self, values: Array) -> Array:
+        """[R, C', P] means of each place (`Track.place`), whose scenarios look the same; [R, C', E] on a track without places."""
+        places = {seed: place for place, seeds in self.most.places.items() for seed in seeds}
+        if not places:
+            return values
+        names = [places[seed] for seed in self.panel.seeds]
+        return np.stack([values[..., [own == name for own in names]].mean(-1) for name in dict.fromkeys(names)], -1)
 
     @cached_property
     def by_run(self) -> Array:
