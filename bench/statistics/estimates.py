@@ -135,13 +135,12 @@ def share_interval(scores: Array) -> Interval:
     """`interval` for scores in [0, 1], such as rates: within [0, 1], and with a width where all scores are 0 or 1.
 
     Wilson's score interval (1927), with the variance of the mean in place of the binomial one. Near 0 it is wider than several
-    runs say (`RARE`): a few trainings that hardly crash do not show that there are no others. Copies of one scenario count once.
+    runs say (`RARE`): a few trainings that hardly crash do not show that there are no others.
 
     Args:
         scores: [R, C, E], as in `interval`, in [0, 1].
     """
     _check(scores)
-    scores = scores[..., :1] if are_copies(scores) else scores
     means = scores.mean(1)
     return _wilson(float(means.mean()), float(components(means).margin()), scores.size, len(scores))
 
@@ -151,27 +150,16 @@ def task_intervals(scores: Array, *, share: bool) -> list[Interval]:
 
     Args:
         scores: [R, C, E], as in `interval`.
-        share: whether the scores are in [0, 1]; copies of one scenario count once then.
+        share: whether the scores are in [0, 1].
     """
     _check(scores)
     means = np.moveaxis(scores, 1, 0)
     estimates, margins = means.mean((1, 2)).tolist(), components(means).margin().tolist()
     episodes, runs = means[0].size, len(scores)
-    if not share:
-        return [_symmetric(*found) for found in zip(estimates, margins, strict=True)]
     return [
-        share_interval(one[:, None]) if are_copies(one) else _wilson(estimate, margin, episodes, runs)
-        for one, estimate, margin in zip(means, estimates, margins, strict=True)
+        _wilson(estimate, margin, episodes, runs) if share else _symmetric(estimate, margin)
+        for estimate, margin in zip(estimates, margins, strict=True)
     ]
-
-
-def are_copies(scores: Array) -> bool:
-    """Whether scenarios are copies of one: all have the same scores [..., E], and not only 0 and 1.
-
-    A world may have one road, or not use its seeds. An interval over those would have no width, and say nothing of others.
-    """
-    first = scores[..., :1]
-    return scores.shape[-1] > 1 and bool((scores == first).all() and ((first != 0) & (first != 1)).any())
 
 
 def _symmetric(estimate: float, margin: float) -> Interval:

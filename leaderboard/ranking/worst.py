@@ -262,13 +262,13 @@ class Worst:
     def worst_cell(self) -> tuple[Cell, Interval]:
         """The cell with the lowest score; of equals the first in the order of tables."""
         place = int(self.scores.mean((0, 2)).round(9).argmin())
-        return self.cells[place], task_intervals(self.scores[:, [place]], share=True)[0]
+        return self.cells[place], task_intervals(self._of_places(self.scores)[:, [place]], share=True)[0]
 
     @cached_property
     def clean(self) -> Interval | None:
         """The same cells and scenarios without an attack; None where a part of them was not driven."""
         found = self._clean
-        return None if found is None or np.isnan(found).any() else share_interval(found)
+        return None if found is None or np.isnan(found).any() else share_interval(self._of_places(found))
 
     @property
     def clean_by_cell(self) -> Array:

@@ -247,18 +247,3 @@ def test_each_way_of_measuring_is_what_it_says() -> None:
         found = measured(arranged, Measure(column="safe_progress", heading="", how=how))  # type: ignore[arg-type]
         assert found.estimate == pytest.approx(value)
         assert np.isnan(found.low) == (how != "mean")
-
-
-def test_copies_of_one_scenario_count_once() -> None:
-    """Fifty times the same road would have an interval without a width."""
-    generator = np.random.default_rng(0)
-    one, three = generator.random((1, 9, 1)), generator.random((3, 9, 1))
-    assert np.isnan(share_interval(one.repeat(50, 2)).low)
-    assert all(np.isnan(found.low) for found in task_intervals(one.repeat(50, 2), share=True))
-    assert share_interval(three.repeat(50, 2)) == share_interval(three)
-    assert task_intervals(three.repeat(50, 2), share=True) == task_intervals(three, share=True)
-    crashes = np.ones((1, 9, 50))
-    assert share_interval(crashes).low > 0.99, "equal outcomes of other scenarios are no copies"
-    almost = one.repeat(50, 2)
-    almost[0, 0, 0] = np.nextafter(almost[0, 0, 0], 1)
-    assert np.isfinite(share_interval(almost).low)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 from collections.abc import Callable
 
@@ -60,6 +61,16 @@ def test_a_ranking_of_seventeen_rows_has_no_sentences_about_each_row(published: 
     assert "too few seeds" not in text
     assert len(text.splitlines()) < 60
     assert "`bench report flags`" in text
+
+
+def test_scenarios_at_one_place_do_not_make_an_interval(boards: list[Board]) -> None:
+    """All of `crossing` are on one road: fifty times the same frames."""
+    rows = [row for board in boards if board.grid == "crossing-v2" for row in board.rows]
+    assert rows
+    for worst in (row.worst for row in rows):
+        assert worst.clean
+        assert worst.failure
+        assert all(math.isnan(found.low) for found in (worst.score, worst.failure, worst.clean, worst.worst_cell[1]))
 
 
 def test_a_row_of_one_patch_has_no_rank(published: dict[str, pa.Table], boards: list[Board]) -> None:
