@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -116,12 +116,7 @@ class Comparison:
     @cached_property
     def places(self) -> dict[str, list[int]]:
         """The scenario seeds of each place (`Track.place`); empty where the track has none."""
-        found: dict[str, list[int]] = {}
-        if self.track.place:
-            columns = (self.own.table[name].to_pylist() for name in ("seed", self.track.place))
-            for seed, place in sorted(set(zip(*columns, strict=True))):
-                found.setdefault(place, []).append(seed)
-        return found
+        return _places(self.own, self.track)
 
     @cached_property
     def scores(self) -> Array:
@@ -131,7 +126,7 @@ class Comparison:
     @cached_property
     def score(self) -> Interval:
         """The metric over all runs and cells."""
-        return share_interval(self.scores)
+        return share_interval(of_places(self.scores, self.own.seeds, self.places))
 
     @cached_property
     def clean_score(self) -> Interval | None:
@@ -145,7 +140,9 @@ class Comparison:
 
     def score_of(self, episodes: Episodes) -> Interval:
         """The metric of other episodes, over all runs and cells."""
-        return share_interval(episodes.column(self.track.metric))
+        return share_interval(
+            of_places(episodes.column(self.track.metric), episodes.seeds, _places(episodes, self.track))
+        )
 
     @property
     def retained(self) -> float:
@@ -232,4 +229,22 @@ def _flat(params: dict[str, object]) -> dict[str, object]:
             found |= {f"{name}.{inner}": each for inner, each in _flat(value).items()}
         else:
             found[name] = value
+    return found
+
+
+def of_places(values: Array, seeds: Sequence[int], places: Mapping[str, Sequence[int]]) -> Array:
+    """[R, C, P] means of each place, whose scenarios look the same, of values [R, C, E]; the values where there are no places."""
+    place_of = {seed: place for place, own in places.items() for seed in own}
+    if not place_of:
+        return values
+    names = [place_of[seed] for seed in seeds]
+    return np.stack([values[..., [own == name for own in names]].mean(-1) for name in dict.fromkeys(names)], -1)
+
+
+def _places(episodes: Episodes, track: Track) -> dict[str, list[int]]:
+    found: dict[str, list[int]] = {}
+    if track.place:
+        columns = (episodes.table[name].to_pylist() for name in ("seed", track.place))
+        for seed, place in sorted(set(zip(*columns, strict=True))):
+            found.setdefault(place, []).append(seed)
     return found

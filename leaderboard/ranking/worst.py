@@ -10,7 +10,7 @@ from functools import cached_property
 
 import numpy as np
 
-from cavbench.leaderboard.comparisons.comparison import Comparison
+from cavbench.leaderboard.comparisons.comparison import Comparison, of_places
 from cavbench.scenarios import Cell
 from cavbench.statistics.certificate import certificate
 from cavbench.statistics.doubts import mean
@@ -229,12 +229,7 @@ class Worst:
         return share_interval(self._of_places(self.failed)) if self.most.track.failure else None
 
     def _of_places(self, values: Array) -> Array:
-        """[R, C', P] means of each place (`Track.place`), whose scenarios look the same; [R, C', E] on a track without places."""
-        places = {seed: place for place, seeds in self.most.places.items() for seed in seeds}
-        if not places:
-            return values
-        names = [places[seed] for seed in self.panel.seeds]
-        return np.stack([values[..., [own == name for own in names]].mean(-1) for name in dict.fromkeys(names)], -1)
+        return of_places(values, self.panel.seeds, self.most.places)
 
     @cached_property
     def by_run(self) -> Array:

@@ -71,6 +71,10 @@ def test_scenarios_at_one_place_do_not_make_an_interval(boards: list[Board]) -> 
         assert worst.clean
         assert worst.failure
         assert all(math.isnan(found.low) for found in (worst.score, worst.failure, worst.clean, worst.worst_cell[1]))
+        for one in worst.panel.attacks:
+            assert math.isnan(one.score.low)
+            assert one.clean_score
+            assert math.isnan(one.clean_score.low)
 
 
 def test_a_row_of_one_patch_has_no_rank(published: dict[str, pa.Table], boards: list[Board]) -> None:
